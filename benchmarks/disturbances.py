@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 START_DEPTH: Final = 0.05  #: insertion depth at the start [m]
 
 
-class Samples(NamedTuple):
+class MotionSamples(NamedTuple):
     """Simulated samples, (n,) each: time [s], insertion depth [m], velocity [m/s], force [N]."""
 
     time: FloatArray
@@ -24,7 +24,7 @@ class Samples(NamedTuple):
 
 
 #: Changes samples; the true parameters and the generator of the noise are given.
-Change = Callable[[Samples, Mapping[str, float], np.random.Generator], Samples]
+Change = Callable[[MotionSamples, Mapping[str, float], np.random.Generator], MotionSamples]
 
 
 def low_pass(values: FloatArray, samples: float) -> FloatArray:
@@ -47,7 +47,9 @@ def with_play(width: float, depth: FloatArray) -> FloatArray:
     return found
 
 
-def drive_play(made: Samples, truth: Mapping[str, float], _: np.random.Generator) -> Samples:
+def drive_play(
+    made: MotionSamples, truth: Mapping[str, float], _: np.random.Generator
+) -> MotionSamples:
     """Move the needle by a drive with 10 um of play; the motion is measured at the motor."""
     needle = np.gradient(with_play(1e-5, made.depth), made.time)
     needle[np.abs(needle) < 1e-6] = 0.0
@@ -55,7 +57,9 @@ def drive_play(made: Samples, truth: Mapping[str, float], _: np.random.Generator
     return made._replace(force=np.asarray(force))
 
 
-def lugre(made: Samples, truth: Mapping[str, float], _: np.random.Generator) -> Samples:
+def lugre(
+    made: MotionSamples, truth: Mapping[str, float], _: np.random.Generator
+) -> MotionSamples:
     """Return the friction of the LuGre model: bristles of 2e5 N/m, 30 % more at rest."""
     stiffness, damping, speed = 2e5, 200.0, 1e-3
     level = 1.0 + 0.3 * np.exp(-((made.speed / speed) ** 2))
@@ -69,12 +73,12 @@ def lugre(made: Samples, truth: Mapping[str, float], _: np.random.Generator) -> 
     return made._replace(force=force)
 
 
-def more_force(more: Callable[[Samples], FloatArray]) -> Change:
+def more_force(more: Callable[[MotionSamples], FloatArray]) -> Change:
     """Return a change that adds a function of the motion to the force."""
     return lambda made, _truth, _rng: made._replace(force=made.force + more(made))
 
 
-def pink(read: Samples, _: Mapping[str, float], rng: np.random.Generator) -> Samples:
+def pink(read: MotionSamples, _: Mapping[str, float], rng: np.random.Generator) -> MotionSamples:
     """Add noise of 0.02 N with a power spectrum of 1 / f."""
     n = len(read.time)
     root = np.sqrt(np.arange(n // 2 + 1))
@@ -83,24 +87,32 @@ def pink(read: Samples, _: Mapping[str, float], rng: np.random.Generator) -> Sam
     return read._replace(force=read.force + 0.02 * noise / noise.std())
 
 
-def aliased(made: Samples, _: Mapping[str, float], rng: np.random.Generator) -> Samples:
+def aliased(
+    made: MotionSamples, _: Mapping[str, float], rng: np.random.Generator
+) -> MotionSamples:
     """Add two harmonics that samples at 250 Hz show at 1.3 and 6.3 Hz."""
     turns = 2.0 * pi * np.outer([251.3, 493.7], made.time) + rng.uniform(0.0, 2.0 * pi, (2, 1))
     return made._replace(force=made.force + np.array([0.05, 0.03]) @ np.sin(turns))
 
 
-def outliers(read: Samples, _: Mapping[str, float], rng: np.random.Generator) -> Samples:
+def outliers(
+    read: MotionSamples, _: Mapping[str, float], rng: np.random.Generator
+) -> MotionSamples:
     n = len(read.time)
     spikes = np.where(rng.random(n) < 0.02, rng.exponential(0.3, n), 0.0)
     return read._replace(force=read.force + spikes)
 
 
-def error_by_speed(read: Samples, _: Mapping[str, float], rng: np.random.Generator) -> Samples:
+def error_by_speed(
+    read: MotionSamples, _: Mapping[str, float], rng: np.random.Generator
+) -> MotionSamples:
     noise = 10.0 * np.abs(read.speed) * rng.standard_normal(len(read.time))
     return read._replace(force=read.force + noise)
 
 
-def sticking(read: Samples, _: Mapping[str, float], rng: np.random.Generator) -> Samples:
+def sticking(
+    read: MotionSamples, _: Mapping[str, float], rng: np.random.Generator
+) -> MotionSamples:
     """Count the force in 0.05 N, and repeat 70 % of the values that change by one count."""
     force = counted(read.force, 0.05)
     fresh = rng.random(len(force)) < 0.3
@@ -110,9 +122,9 @@ def sticking(read: Samples, _: Mapping[str, float], rng: np.random.Generator) ->
     return read._replace(force=force)
 
 
-def jitter(read: Samples, _: Mapping[str, float], rng: np.random.Generator) -> Samples:
+def jitter(read: MotionSamples, _: Mapping[str, float], rng: np.random.Generator) -> MotionSamples:
     """Shift stamps by up to 1.5 ms, and drop a tenth of the samples."""
     n = len(read.time)
     late = read._replace(time=read.time + rng.uniform(-1.5e-3, 1.5e-3, n))
     kept = rng.random(n) > 0.1
-    return Samples(*(values[kept] for values in late))
+    return MotionSamples(*(values[kept] for values in late))

@@ -28,9 +28,9 @@ from benchmarks.disturbances import (
     low_pass,
     lugre,
     more_force,
+    MotionSamples,
     outliers,
     pink,
-    Samples,
     START_DEPTH,
     sticking,
     with_play,
@@ -121,7 +121,7 @@ def recorded(
     speed = _strokes(rng, kind.duration, step, kind.speeds)
     travel = np.concatenate([[0.0], np.cumsum(0.5 * step * (speed[1:] + speed[:-1]))])
     time = np.asarray(np.arange(len(speed)) * step, dtype=np.float64)
-    made = Samples(time, START_DEPTH + travel, speed, _force(truth, time, speed))
+    made = MotionSamples(time, START_DEPTH + travel, speed, _force(truth, time, speed))
     if kind.plant:
         made = kind.plant(made, truth, rng)
     if kind.speed_filter:
@@ -132,7 +132,7 @@ def recorded(
     depth = counted(depth, kind.position_counts)
     speed = speed + (0.0 if kind.positions_only else kind.speed_noise * rng.standard_normal(n))
     force = counted(force + _noise(kind, rng, n), kind.counts)
-    read = Samples(time, depth, speed, force)
+    read = MotionSamples(time, depth, speed, force)
     if kind.sensor:
         read = kind.sensor(read, truth, rng)
     recording = Recording(
