@@ -16,8 +16,8 @@ class Admittance:
     Virtual needle base that is driven by the force of a law and commands the robot's position.
 
     The base has the inertia and the friction of the nominal axis, and the law is given its state
-    instead of the measured one, so that it controls its nominal plant, whatever the delay of the
-    robot: :math:`M \dot{v} = f - \mu_v v - \mu_s(v)`. Each step is the exact flow under a constant
+    instead of the measured one: it controls its nominal plant, independent of the delay of the
+    robot, :math:`M \dot{v} = f - \mu_v v - \mu_s(v)`. Each step is the exact flow under a constant
     force, in which Coulomb friction is set-valued: a force below friction holds the position, and
     a constant larger one leads to the velocity :math:`(f - \mu_s) / \mu_v`. The base is passive.
     ``period`` is the sample period [s], ``speed`` the largest speed of the base [m/s],
@@ -43,16 +43,13 @@ class Admittance:
         self.velocity = 0.0  #: Velocity of the base [m/s].
         self.measured = 0.0  #: Last measured insertion depth [m].
         self.answered: int | None = None  #: Stamp of the last step [ns]; None at rest.
-        #: States of the last steps, that of the delay first.
+        #: States of the last steps; the first one is by the delay of the law before now.
         self._states = deque[BaseState](maxlen=delay + 1)
 
     def state(self, measured: float) -> BaseState:
         """Return the state for the law, at a measured depth [m]."""
-        if self._states:
-            return self._states[0]
-        return BaseState(
-            measured if self.position is None else self._near(self.position, measured), 0.0
-        )
+        rest = measured if self.position is None else self._near(self.position, measured)
+        return self._states[0] if self._states else BaseState(rest, 0.0)
 
     def _near(self, position: float, measured: float) -> float:
         return min(max(position, measured - self._lead), measured + self._lead)

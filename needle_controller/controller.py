@@ -417,8 +417,8 @@ class Controller:
         if self.relaxed:
             loop.unwind()
         force = 0.0 if self.relaxed else loop.command(base.depth, base.velocity, ahead, load)
-        # A base that waits holds the reference, as a force at its limit does.
-        self._hold.command(now, base.depth, force, 0.0 if base.waits else loop.limit)
+        limited = base.waits or abs(force) >= loop.limit
+        self._hold.command(now, base.depth, force, limited=limited)
         return ControllerOutput(force=force, torque=torque, setpoint=now, notice=notice)
 
     def _returned(self, measured: Measurement) -> str | None:

@@ -241,7 +241,7 @@ class TrajectoryClient:
             raise ParameterError(f'the action {action} needs control_msgs: install it') from None
         self._action, self._take = action, take
         self._client = ActionClient(node, self._kind, action)
-        self._last = JointTrajectory()  #: The last trajectory, which supersedes older ones.
+        self._last = JointTrajectory()  #: The last trajectory; it supersedes older ones.
 
     def destroy(self) -> None:
         self._client.destroy()

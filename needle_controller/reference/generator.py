@@ -244,9 +244,9 @@ class ReferenceHold:
             self._obeyed = 0
         return self._obeyed >= _TRUSTED and time - last > self._gap
 
-    def command(self, aim: Setpoint, depth: float, force: float, limit: float) -> None:
-        """Process the command for a setpoint and insertion depth [m], and its limit [N]."""
+    def command(self, aim: Setpoint, depth: float, force: float, *, limited: bool) -> None:
+        """Process the command for a setpoint and depth [m]; at a limit the motion is held."""
         self._error = aim.position - depth
         self._forces.append(force)
         ahead = force * ((self._guide.target or 0.0) - aim.position) > 0.0
-        self._guide.held = abs(force) >= limit and ahead and not self._guide.paused
+        self._guide.held = limited and ahead and not self._guide.paused

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import floor, inf, isfinite, log10, nan, sqrt
@@ -153,18 +154,18 @@ def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:
     )
 
 
-#: Estimates with what each is for: a recording, a force level or a medium.
+#: Estimates with their recording, force level or medium.
 EstimateRows: TypeAlias = Iterable[tuple[str, ParameterEstimate | Statistic]]
 
 
-class DisplayedEstimate(Displayed):
+class DisplayedEstimate(Displayed, ABC):
     """Estimate that displays its parameters; a subclass defines `rows`."""
 
     __slots__ = ()
 
+    @abstractmethod
     def rows(self) -> EstimateRows:
         """Return the parameters, each with its recording, force level or medium."""
-        raise NotImplementedError
 
     def columns(self) -> dict[str, NDArray[Any]]:
         heads = 'of', 'parameter', 'unit', 'value', 'standard error', 'low', 'high'

@@ -3,6 +3,7 @@
 
 from dataclasses import dataclass
 from typing import Final
+import warnings
 
 from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.memory import Memory, Parts
@@ -10,6 +11,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
 _FEWEST_PARTS: Final = 10  # smallest number of parts for any test
+_FEWEST_FOR_MOMENTS: Final = 20  # smallest number of parts, else Shapiro and Wilk
 _SIGNIFICANCE: Final = 0.0025  # 1 % of the recordings fail any of the four by chance
 
 #: Result of each test in words, if failed and if passed.
@@ -85,6 +87,14 @@ def _words(name: str, p_value: float) -> str:
 
 def _normality(values: FloatArray) -> tuple[float, float]:
     """Test for a normal distribution by skewness and kurtosis (d'Agostino and Pearson)."""
+    if len(values) < _FEWEST_FOR_MOMENTS:
+        # Lazy import: large, and needed for short recordings only.
+        from scipy.stats import shapiro
+
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            found = shapiro(values)
+        return float(found.statistic), float(found.pvalue)
     n, normalized = float(len(values)), (values - values.mean()) / values.std()
     skewness, kurtosis = (float((normalized**power).mean()) for power in (3, 4))
     found = float(_skewness_score(skewness, n) ** 2 + _kurtosis_score(kurtosis, n) ** 2)

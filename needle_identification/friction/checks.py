@@ -21,8 +21,11 @@ _FRICTION: Final = ('coulomb_friction', 'viscous_friction')
 def check_friction(parameters: Sequence[ParameterEstimate]) -> None:
     """Raise `IdentificationError` if friction is clearly negative or not significant."""
     friction = [parameter for parameter in parameters if parameter.name in _FRICTION]
-    by_depth = 'length_friction' in {p.name for p in parameters}  # mu_s is extrapolated
-    for parameter in [one for one in friction if not (by_depth and one.unit == 'N')]:
+    # With friction by depth, mu_s is extrapolated.
+    by_depth = any(parameter.name == 'length_friction' for parameter in parameters)
+    for parameter in friction:
+        if by_depth and parameter.name == 'coulomb_friction':
+            continue
         if parameter.determined and parameter.value + 2.0 * parameter.error < 0.0:
             raise IdentificationError(
                 f'friction must not be negative, got {parameter.symbol} = {parameter.value:.3g} '

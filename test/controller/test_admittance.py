@@ -120,10 +120,10 @@ def test_base_gives_way_out_of_the_tissue_only(force: float, lag: float) -> None
     assert found <= min(position, 0.02 + lag)
 
 
-def follow(
+def drive(
     law: str, rate: float, lag: float, dead: float = 0.0, seconds: float = 8.0
-) -> tuple[float, float, float]:
-    """Drive a robot that follows with a lag; return overshoot, error and motion at the end [m]."""
+) -> tuple[list[float], list[float]]:
+    """Drive a robot that follows with a lag; return its depths and the commanded ones [m]."""
     controller = Controller(PHANTOM, law, settings=ControllerSettings(rate=rate))
     period = controller.period
     base = Admittance(
@@ -133,16 +133,25 @@ def follow(
     depth, speed, late = 0.02, 0.0, round(dead * rate)
     sent = deque([depth] * (late + 1), maxlen=late + 1)
     share = 1.0 - exp(-period / lag) if lag else 1.0
-    path = []
+    path, commands = list[float](), list[float]()
     for k in range(int(seconds * rate)):
         time = k * period
         measured = Measurement(time=time, depth=depth, velocity=speed, base=base.state(depth))
         command = controller.command(measured)
         assert command.fault is None
-        sent.append(base.step(command.force, depth, round(1e9 * time)))
+        commands.append(base.step(command.force, depth, round(1e9 * time)))
+        sent.append(commands[-1])
         moved = share * (sent[0] - depth)
         depth, speed = depth + moved, moved / period
         path.append(depth)
+    return path, commands
+
+
+def follow(
+    law: str, rate: float, lag: float, dead: float = 0.0, seconds: float = 8.0
+) -> tuple[float, float, float]:
+    """Return overshoot, error and motion at the end [m]; see `drive`."""
+    path, _ = drive(law, rate, lag, dead, seconds)
     last = path[-int(rate) :]
     return max(path) - 0.05, abs(path[-1] - 0.05), max(last) - min(last)
 
@@ -168,12 +177,18 @@ def test_robot_with_any_delay_arrives_without_oscillation(
 ) -> None:
     """The law controls the base: PID overshoots as without delay, the others by the wait."""
     over, error, motion = follow(law, rate, lag, dead, seconds)
+    # PID: 0.34 mm without delay. Others: 0.16 mm at 100 Hz, from the last wait of the base.
     assert over < (4e-4 if law == 'pid' else 2e-4)
+    # Dry friction holds the base of PID 0.02 mm from the target; the lag has ended.
     assert error < 5e-5
     assert motion < 1e-5
 
 
 @pytest.mark.parametrize('law', ['adaptive', 'inverse_dynamics', 'pid'])
 def test_commands_do_not_depend_on_the_delay_of_the_robot(law: str) -> None:
-    """As long as it is less than the lead behind."""
-    assert follow(law, 500.0, 0.05, 0.02)[0] == pytest.approx(follow(law, 500.0, 0.0)[0], abs=1e-5)
+    """As long as it is less than the lead behind: they are equal to the bit."""
+    (late, commands), (prompt, others) = drive(law, 500.0, 0.05, 0.02), drive(law, 500.0, 0.0)
+    assert commands == others
+    # The lag smooths the overshoot of PID by 4 um.
+    assert max(late) == pytest.approx(max(prompt), abs=1e-5)
+    assert max(abs(one - other) for one, other in zip(late, prompt, strict=True)) > 1e-4

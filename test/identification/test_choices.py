@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from math import exp, log
 import re
@@ -199,6 +200,12 @@ def test_velocities_filtered_by_the_driver_are_replaced(seed: int) -> None:
     assert velocity_delay(replace(recording, velocity=None)) == 0.0
 
 
+def holding(found: FrictionEstimate, truth: Mapping[str, float]) -> int:
+    """Return the number of intervals that contain the true value."""
+    intervals = [(found[name].interval, value) for name, value in truth.items()]
+    return sum(low <= value <= high for (low, high), value in intervals)
+
+
 def test_low_pass_taps_are_the_exact_filter_less_its_mean_delay() -> None:
     period, time_constant = 0.004, 0.02
     time = period * np.arange(500)
@@ -221,9 +228,7 @@ def test_intervals_hold_behind_a_low_pass_filter_of_the_force() -> None:
         found = identify_friction(recording)
         assert any('low-pass filter of about 8' in words for words in found.warnings)
         assert not advised(found)
-        for name, value in truth.items():
-            low, high = found[name].interval
-            held += low <= value <= high
+        held += holding(found, truth)
     # 95 % of 60 less three standard deviations; 35 without the filter of the motion.
     assert held >= 52
 
@@ -235,9 +240,7 @@ def test_intervals_hold_with_play_of_the_drive() -> None:
         recording, truth = recorded(FURTHER['play of the drive'].kind, np.random.default_rng(seed))
         found = identify_friction(recording)
         assert any('presliding, play' in words for words in found.warnings)
-        for name, value in truth.items():
-            low, high = found[name].interval
-            held += low <= value <= high
+        held += holding(found, truth)
     # 95 % of 30 less three standard deviations.
     assert held >= 24
 
@@ -256,9 +259,7 @@ def test_the_advised_term_describes_a_force_by_depth_or_time(kind: str) -> None:
         )
         taken = identify_friction(recording, settings)
         assert not advised(taken)
-        for name, value in truth.items():
-            low, high = taken[name].interval
-            held += low <= value <= high
+        held += holding(taken, truth)
     # 95 % of 16 less three standard deviations.
     assert held >= 12
 

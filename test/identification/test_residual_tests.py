@@ -55,6 +55,14 @@ def test_equal_values_share_their_rank() -> None:
     assert_allclose(ours._ranks(values), stats.rankdata(values), rtol=0.0)
 
 
+def test_few_parts_are_tested_for_normality_by_shapiro_and_wilk() -> None:
+    means, velocities = np.random.default_rng(0).normal(size=(2, 15))
+    # 1e-9: rounding of the means over parts.
+    assert_allclose(
+        results_of(means, velocities)['normality'].p_value, stats.shapiro(means).pvalue, rtol=1e-9
+    )
+
+
 @pytest.mark.parametrize('name', ['normality', 'trend', 'speed', 'spread'])
 def test_each_test_detects_its_own_fault(name: str) -> None:
     rng = np.random.default_rng(1)
