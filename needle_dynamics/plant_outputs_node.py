@@ -278,13 +278,9 @@ class SampleReports:
         self._node.publish_diagnostics()
 
     def _on_recorded(self, message: Header) -> None:
-        recorded, stamp = self._clock.recorded, nanoseconds(message.stamp)
-        before = len(recorded)
-        recorded[message.frame_id] = stamp
-        if not stamp:
-            # A zero stamp marks the end of the recording.
-            del recorded[message.frame_id]
-        if len(recorded) != before:
+        before = len(self._clock.recorded)
+        self._clock.record(message.frame_id, nanoseconds(message.stamp))
+        if len(self._clock.recorded) != before:
             self._node.publish_diagnostics()
         if self._node.is_active:
             self._advance()

@@ -68,10 +68,17 @@ class SampleClock:
     @property
     def awaited(self) -> int | None:
         """Stamp of the sample that waits for responses [ns]; None if no sample waits."""
-        if self._answers is None:
-            return None
-        answered = self.commanded and len(self._answers) > self.participants
+        answers = self._answers
+        answered = answers is None or (self.commanded and len(answers) > self.participants)
         return None if answered and self._is_recorded else self.stamp
+
+    def record(self, by: str, stamp: int) -> None:
+        """Record the newest sample of a recorder [ns], 0 at the end of its recording."""
+        if stamp:
+            # A new recorder need not have the samples before it.
+            self.recorded[by] = max(stamp, self.recorded.get(by, self.stamp))
+        else:
+            self.recorded.pop(by, None)
 
     @property
     def _is_recorded(self) -> bool:
@@ -88,7 +95,7 @@ class SampleClock:
         if not self.commanded:
             return 'no command has answered'
         if not self._is_recorded:
-            return f'a recorder is {_AHEAD[True]} samples behind'
+            return f'a recorder is {_AHEAD[self._lockstep]} samples behind'
         done = len(self._answers or ()) - 1
         return f'{done} of {self.participants} nodes have processed'
 
@@ -100,7 +107,7 @@ class SampleClock:
 
     def due(self, now: int) -> int:
         """Return the number of samples to take at a time of the clock [ns]."""
-        if self.paused or self.awaited is not None or not self._is_recorded:
+        if self.paused or self.awaited is not None:
             return 0
         if not self._factor:
             return 1 if self._lockstep else self._burst

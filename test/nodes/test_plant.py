@@ -29,7 +29,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 from std_srvs.srv._trigger import Trigger_Response
 from support.ros_graph import RosGraph
@@ -695,6 +695,28 @@ def test_stall_drops_samples_or_delays_simulated_time(ros_graph: RosGraph, facto
         assert given_up == 0
         assert bench.plant.diagnose().status.waited >= 0.44
         assert set(stamps) <= {9_999_999, 10_000_000, 10_000_001}
+
+
+def test_time_waits_for_a_recorder_and_repeats_the_newest_sample(ros_graph: RosGraph) -> None:
+    """A recorder that subscribes while time waits receives the sample: neither waits forever."""
+    bench = Bench(ros_graph, publish_clock=True)
+    recorder = ros_graph.node('recorder')
+    reports = recorder.create_publisher(Header, 'joint_states/_recorded', COMMAND)
+
+    def lags() -> bool:
+        report = Header(frame_id='/recorder')
+        report.stamp.nanosec = 1
+        reports.publish(report)
+        return 'a recorder is 80 samples behind' in bench.plant.diagnose().message
+
+    bench.until(lags, 'the lag')
+    sample = ros_graph.latest(recorder, JointState, 'joint_states', SENSOR)
+    bench.until(lambda: sample.message, 'the sample again')
+    assert stamp_ns(sample.message) == stamp_ns(bench.states[-1])
+    number = len(bench.states)
+    report = Header(frame_id='/recorder', stamp=sample.message.header.stamp)
+    reports.publish(report)
+    bench.until(lambda: len(bench.states) > number + 10, 'the next samples')
 
 
 def test_clock_topic_drives_a_node_with_simulated_time(ros_graph: RosGraph) -> None:

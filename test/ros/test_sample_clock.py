@@ -126,26 +126,33 @@ def test_lockstep_waits_for_all_processing_nodes() -> None:
     assert take(clock, later + 1_000_000) == [stamp + 1_000_000]
 
 
-def test_lockstep_recorder_lag_is_at_most_10_samples() -> None:
-    """Time waits until the recorder catches up or ends."""
-    clock, now = make(factor=0.0, lockstep=True), BEGIN
-    clock.recorded['recorder'] = 1
-    stamps = []
+@pytest.mark.parametrize('lockstep', [True, False])
+@given(before=st.integers(0, 200))
+@settings(max_examples=20)
+def test_lag_of_a_recorder_is_limited(lockstep: bool, before: int) -> None:
+    """Time waits until a recorder catches up or ends; it need not have samples from before it."""
+    clock, most = make(factor=0.0, own=True, lockstep=lockstep), 10 if lockstep else 80
+    stamps: list[int] = []
 
-    def run() -> None:
-        for stamp in (stamp for _ in range(100) for stamp in take(clock, now)):
-            stamps.append(stamp)
-            clock.answered(stamp)
+    def run(number: int) -> int:
+        """Take up to this many samples; return how many."""
+        first = len(stamps)
+        for _ in range(number):
+            # At maximum speed several are due at once.
+            if clock.due(BEGIN):
+                stamps.append(clock.take())
+                clock.answered(stamps[-1])
+        return len(stamps) - first
 
-    run()
-    assert len(stamps) == 11
-    assert clock.missing == 'a recorder is 10 samples behind'
-    clock.recorded['recorder'] = stamps[9]
-    run()
-    assert len(stamps) == 21
-    clock.recorded.clear()
-    run()
-    assert len(stamps) == 121
+    assert run(before) == before
+    clock.record('recorder', 1)
+    assert run(300) == most + 1
+    assert clock.awaited == stamps[-1]
+    assert clock.missing == f'a recorder is {most} samples behind'
+    clock.record('recorder', stamps[-2])
+    assert run(300) == most
+    clock.record('recorder', 0)
+    assert run(300) == 300
 
 
 def test_lockstep_makes_up_a_stall() -> None:
