@@ -278,9 +278,7 @@ class SampleReports:
         self._node.publish_diagnostics()
 
     def _on_recorded(self, message: Header) -> None:
-        before = len(self._clock.recorded)
-        self._clock.record(message.frame_id, nanoseconds(message.stamp))
-        if len(self._clock.recorded) != before:
+        if self._clock.record(message.frame_id, nanoseconds(message.stamp)):
             self._node.publish_diagnostics()
         if self._node.is_active:
             self._advance()

@@ -72,19 +72,17 @@ class SampleClock:
         answered = answers is None or (self.commanded and len(answers) > self.participants)
         return None if answered and self._is_recorded else self.stamp
 
-    def record(self, by: str, stamp: int) -> None:
-        """Record the newest sample of a recorder [ns], 0 at the end of its recording."""
+    def record(self, by: str, stamp: int) -> bool:
+        """Set the newest sample of a recorder [ns], 0 at its end; return if it comes or ends."""
+        # A new recorder need not have the samples before it.
+        before = self.recorded.pop(by, 0)
         if stamp:
-            # A new recorder need not have the samples before it.
-            self.recorded[by] = max(stamp, self.recorded.get(by, self.stamp))
-        else:
-            self.recorded.pop(by, None)
+            self.recorded[by] = max(stamp, before or self.stamp)
+        return (before > 0) != (stamp > 0)
 
     @property
     def _is_recorded(self) -> bool:
         """Whether all recorders are close enough to the newest sample."""
-        if not self.recorded:
-            return True
         ahead = round(_AHEAD[self._lockstep] * NANOSECONDS / self._rate)
         first = max(self._start, self.stamp - ahead)
         return all(max(stamp, self._start) >= first for stamp in self.recorded.values())

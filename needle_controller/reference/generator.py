@@ -190,9 +190,9 @@ class ReferenceHold:
 
     def __init__(self, guide: ReferenceGenerator, period: float, delay: int) -> None:
         self._guide, self._gap = guide, max(_GAP, _PERIODS * period) + delay * period
-        #: Age of the last measurement, or time since the previous one if that is longer [s].
-        self._late = 0.0
-        #: `_late` before a gap while measurements are late, and their number since then.
+        #: Age of the last two measurements, or time since the previous one if that is longer [s].
+        self._late = deque([0.0, 0.0], maxlen=2)
+        #: Least of them before a gap while measurements are late, and their number since then.
         self._usual: float | None = None
         self._waited = 0
         #: Last forces [N], the oldest acts; tracking error at the last command [m]; whether the
@@ -207,8 +207,9 @@ class ReferenceHold:
         guide, missing, (time, velocity, reported) = self._guide, self.missing, sample
         # Measurements that are always late or rare are no gap. After one, those that have waited
         # are no later than usual in the end.
-        before, self._late = self._late, max(time - guide.now, age)
-        begins = self._late > max(self._gap, _PERIODS * before)
+        before, late = min(self._late), max(time - guide.now, age)
+        self._late.append(late)
+        begins = late > max(self._gap, _PERIODS * before)
         self._waited = 0 if begins else self._waited + 1
         behind = self._usual is not None and age > _ROUNDING * self._usual
         gap = begins or (behind and self._waited < _BURST)
