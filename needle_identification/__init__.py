@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from needle_identification.friction.estimate import FrictionSummary as FrictionSummary
     from needle_identification.friction.estimate import summarize as summarize
     from needle_identification.friction.identify import identify_friction as identify_friction
-    from needle_identification.friction.recursive import RecursiveFriction as RecursiveFriction
     from needle_identification.friction.settings import FrictionSettings as FrictionSettings
     from needle_identification.friction.settings import TERMS as TERMS
     from needle_identification.recordings.inspection import inspect_recording as inspect_recording
     from needle_identification.recordings.inspection import Inspection as Inspection
+    from needle_identification.recordings.live import LiveRecording as LiveRecording
     from needle_identification.recordings.reading import (
         read_friction_recording as read_friction_recording,
     )

@@ -2,18 +2,19 @@
 """Node that identifies friction and stiffness from recordings and from running topics."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 import sys
+from time import monotonic
 from typing import Any, ClassVar, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from needle_identification.estimation.estimate import measured, Statistic, statistic
+from needle_identification.estimation.estimate import measured, Statistic
 from needle_identification.friction.estimate import FrictionEstimate, FrictionSummary, summarize
 from needle_identification.friction.identify import identify_friction
-from needle_identification.friction.recursive import LiveFriction
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.recordings import TIMES
+from needle_identification.recordings.live import LiveRecording
 from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
@@ -27,7 +28,7 @@ from needle_identification.stiffness.identify import (
 )
 from needle_identification.stiffness.plateaus import StiffnessSettings
 from needle_ros import contract
-from needle_ros.base_node import BaseNode
+from needle_ros.base_node import BaseNode, profile
 from needle_ros.calls_node import Calls
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
@@ -50,15 +51,18 @@ WHAT: Final = ('friction', 'stiffness')  #: quantities that can be identified
 #: Parameters that a running plant can change; all others are fixed.
 _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
 
+#: QoS for all samples that arrive during an identification, and the least time from its start to
+#: the next start, as a multiple of its duration.
+_ALL: Final = profile(contract.SENSOR._replace(depth=5000), request=True)
+_REST: Final = 5.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IdentificationSettings(CheckedSettings):
     """Settings of the node; each field has its meaning and unit."""
 
     level: float = constant(0.0, 'N', 'stiffness: force level of the result; 0: the largest')
-    forgetting: float = positive(
-        60.0, 's', 'live: time in motion in which the weight of a sample falls to 1/e'
-    )
+    window: float = positive(60.0, 's', 'live: duration of the last motions that are used')
 
 
 def _outcome(
@@ -85,9 +89,10 @@ class IdentificationNode(BaseNode):
 
     The result is published latched on ``friction`` or ``stiffness``. Recordings named in ``bags``
     are identified on activation and by each call of ``~/identify``; ``bags`` may change in
-    between. With ``live`` the node also subscribes to ``joint_states`` and ``base_wrench`` and
-    publishes ``friction`` once a second. ``~/apply`` sets the last result in the nodes named in
-    ``apply_to``; the response lists the parameters that each node set.
+    between. With ``live`` the node also subscribes to ``joint_states`` and ``base_wrench``, and
+    once a second identifies ``friction`` from their last motions as from a recording. ``~/apply``
+    sets the last result in the nodes named in ``apply_to``; the response lists the parameters that
+    each node set.
 
     Identification fails as a whole if a recording cannot be identified. It runs within the
     callback, which blocks the node for some tenths of a second per recording.
@@ -119,7 +124,9 @@ class IdentificationNode(BaseNode):
         self._bags: list[str] = []
         self._found: Sequence[Statistic] = ()
         self._words = ''
-        self._live: LiveFriction | None = None
+        self._live: LiveRecording | None = None
+        #: Warnings or error of the live identification, and time of the next one [s].
+        self._doubts, self._next = '', 0.0
         self._setters: dict[str, Client] = {}
         self._calls = Calls(self)
 
@@ -156,13 +163,12 @@ class IdentificationNode(BaseNode):
         if self._bags:
             self._identify()
         if self._is_live:
-            forgetting = self.settings('', IdentificationSettings).forgetting
-            self._live = LiveFriction(self.settings('friction.', FrictionSettings), forgetting)
+            self._live = LiveRecording(self.settings('', IdentificationSettings).window)
             self._listening = (
-                self.listen(contract.JOINT_STATES, self._on_motion),
-                self.listen(contract.BASE_WRENCH, self._on_force),
+                self.listen(contract.JOINT_STATES, self._on_motion, qos=_ALL),
+                self.listen(contract.BASE_WRENCH, self._on_force, qos=_ALL),
             )
-            self._timer = self.create_timer(1.0, self._publish_live)
+            self._timer = self.create_timer(1.0, self._identify_live)
 
     def about(self) -> str:
         topics = f'{contract.JOINT_STATES.name} and {contract.BASE_WRENCH.name}'
@@ -186,7 +192,10 @@ class IdentificationNode(BaseNode):
             if not samples:
                 message = f'no joint_states of {self._joint[1]} paired with base_wrench'
                 return Diagnosis(Severity.WARNING, message, status)
-            return Diagnosis(Severity.INFO, _sentence(self._live_statistics()), status)
+            words = (_sentence(self._found), self._doubts, *self._live.losses)
+            message = '; '.join(filter(None, words))
+            severity = Severity.WARNING if self._doubts else Severity.INFO
+            return Diagnosis(severity, message, status)
         message = self._words if self._found else 'nothing identified yet'
         return Diagnosis(Severity.INFO, message, status)
 
@@ -277,18 +286,24 @@ class IdentificationNode(BaseNode):
             sign, axis = self._force_axis
             self._live.take_force(reading.stamp, sign * reading.values[0][AXES.index(axis)])
 
-    def _live_statistics(self) -> list[Statistic]:
-        estimates = () if self._live is None else self._live.estimate()
-        return [replace(statistic([one]), interval=one.interval) for one in estimates]
-
-    def _publish_live(self) -> None:
-        found = self._live_statistics()
-        if self._live is not None and found:
-            if any(one.count for one in found):
-                self._found = found
-            samples = self._live.samples
-            statuses = [_of_statistic(one, samples=samples, source='live') for one in found]
-            self._publish(self._friction, statuses)
+    def _identify_live(self) -> None:
+        """Identify, and publish the result; at most a fifth of the time is spent here."""
+        begin, doubts = monotonic(), self._doubts
+        if self._live is None or not self._live.samples or begin < self._next:
+            return
+        try:
+            recording = self._live.recording()
+            estimate = identify_friction(recording, self.settings('friction.', FrictionSettings))
+        except NeedleError as error:
+            self._doubts = str(error)
+        else:
+            self._doubts = '; '.join(estimate.warnings)
+            summary = summarize([estimate])
+            self._found = summary.statistics
+            self._publish(self._friction, _summary_statuses(summary, 'live'))
+        if self._doubts != doubts:
+            self.report_change()
+        self._next = begin + _REST * (monotonic() - begin)
 
     # Parameters of running nodes.
 
@@ -343,12 +358,16 @@ def _answer_later(service: Service) -> None:
     service.send_response = send_later  # type: ignore[method-assign]
 
 
-def _summary_statuses(summary: FrictionSummary | StiffnessSummary) -> list[DiagnosticStatus]:
+def _summary_statuses(
+    summary: FrictionSummary | StiffnessSummary, source: str = 'recordings'
+) -> list[DiagnosticStatus]:
     """Return one status per parameter and force level, then one per recording."""
     if isinstance(summary, FrictionSummary):
         samples = sum(one.samples for one in summary.estimates)
-        statuses = [_of_statistic(one, samples=samples) for one in summary.statistics]
-        return [*statuses, *map(_of_friction, summary.estimates)]
+        statuses = [
+            _of_statistic(one, samples=samples, source=source) for one in summary.statistics
+        ]
+        return [*statuses, *(_of_friction(one, source) for one in summary.estimates)]
     statuses = [_of_statistic(summary.tissue_stiffness)]
     for level in summary.levels:
         at = f' at {level.force:.2f} N'
@@ -375,7 +394,7 @@ def _of_statistic(
     return status
 
 
-def _of_friction(estimate: FrictionEstimate) -> DiagnosticStatus:
+def _of_friction(estimate: FrictionEstimate, source: str) -> DiagnosticStatus:
     parameters = (*estimate.parameters, estimate.breakaway, estimate.lag)
     values = {
         **{p.name: measured(p.value, p.error, p.unit) for p in parameters if p is not None},
@@ -383,8 +402,9 @@ def _of_friction(estimate: FrictionEstimate) -> DiagnosticStatus:
         'residual': estimate.residual,
         'determination': estimate.determination,
         'condition': estimate.condition,
+        'warnings': '; '.join(estimate.warnings) or None,
     }
-    return _status(estimate.name, f'R^2 = {estimate.determination:.4f}', values)
+    return _status(estimate.name, f'R^2 = {estimate.determination:.4f}', values, source)
 
 
 def _of_stiffness(estimate: StiffnessEstimate) -> DiagnosticStatus:

@@ -22,7 +22,7 @@ AUTO: Final = 'auto'  #: automatic choice of the estimator
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrictionSettings:
     """
-    Settings of `identify_friction` and `RecursiveFriction`; fields describe meaning and unit.
+    Settings of `identify_friction`; fields describe meaning and unit.
 
     The default terms are equation (15). The estimator ``weighted`` estimates the noise in each
     stroke, ``total`` accounts for velocity noise; ``auto`` is ``total`` if velocity noise is

@@ -4,7 +4,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Sequence, Set
 from math import inf
-from typing import Final, NamedTuple, NoReturn
+from typing import Final, NamedTuple, NoReturn, Protocol
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.bags.bag import Bag
@@ -75,6 +75,26 @@ class Series:
             self.width = 2 * self.width or FINEST
             stamps, values, weights = _binned(stamps, values, weights, self.width)
         self.stamps, self.values, self._weights = stamps, values, weights
+
+    def losses(self, name: str) -> list[str]:
+        """Return the repaired and discarded data of the topic `name`."""
+        return [
+            words
+            for found, words in (
+                (self.late, f'{self.late} of {name} out of order, sorted by stamp'),
+                (self.repeated, f'{self.repeated} of {name} with the stamp of another, left out'),
+                (
+                    self.width > FINEST,
+                    f'{name} is averaged over {1e-9 * self.width:g} s, because it is very long',
+                ),
+            )
+            if found
+        ]
+
+    def keep(self, kept: BoolArray) -> None:
+        """Discard all samples except some, (n,), after `compact`."""
+        self.stamps, self.values = self.stamps[kept], self.values[kept]
+        self._weights = self._weights[kept]
 
 
 def _binned(
@@ -249,6 +269,15 @@ def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> 
     return _Vector(*axes)
 
 
+class Origin(Protocol):
+    """Bag or running topics: its name for messages, and its discarded and repaired data."""
+
+    losses: list[str]
+
+    @property
+    def path(self) -> object: ...
+
+
 class Samples(NamedTuple):
     """Samples of a topic."""
 
@@ -301,19 +330,14 @@ class Gathering:
         for count, what in (
             (self._invalid, f'not readable, left out: the first one {self._fault}'),
             (self._unstamped, 'without a stamp, the receive time is used'),
-            (series.late, 'out of order, sorted by stamp'),
             (self._unusable, 'not finite, left out'),
-            (series.repeated, 'with the stamp of another, left out'),
         ):
             if count:
                 bag.losses.append(f'{count} of {name} {what}')
+        bag.losses += series.losses(name)
         # A larger fraction is another robot on the same topic.
         if 0 < self._unwanted < _STRAY * self._messages:
             bag.losses.append(f'{self._unwanted} of {name} name other joints, left out')
-        if series.width > FINEST:
-            bag.losses.append(
-                f'{name} is averaged over {1e-9 * series.width:g} s, because it is very long'
-            )
         if len(series.stamps) < 2:
             fault = f'must have >= 2 samples at different times, has {len(series.stamps)}'
             self._reject(bag, fault)
@@ -335,7 +359,7 @@ def are_gaps(steps: IntArray | FloatArray) -> BoolArray:
     return np.asarray(steps > _GAP * np.median(steps))
 
 
-def position_and_velocity(samples: Samples, bag: Bag) -> Samples:
+def position_and_velocity(samples: Samples, bag: Origin) -> Samples:
     """Return the position and, if measured, the velocity; a velocity alone is integrated."""
     topic, _, values, _ = samples
     if values.shape[1] == 1:
@@ -358,7 +382,7 @@ def position_and_velocity(samples: Samples, bag: Bag) -> Samples:
     return samples._replace(values=values[:, :1])
 
 
-def _from_velocity(samples: Samples, bag: Bag) -> Samples:
+def _from_velocity(samples: Samples, bag: Origin) -> Samples:
     bag.losses.append(f'{samples.topic} has no position: depth is the integral of speed from 0')
     time = (samples.stamps - samples.stamps[0]) * 1e-9
     velocity = samples.values[:, 0]

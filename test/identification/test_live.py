@@ -1,12 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Friction from running topics: messages are paired by stamp, in any order."""
+"""Running topics as a recording: the same friction as from a bag, in any order of messages."""
 
+from collections.abc import Iterable
 from math import inf, nan
+from pathlib import Path
 
+from benchmarks.noises import FURTHER, NoiseKind, recorded
 from needle_dynamics import ParameterError
-from needle_identification import FrictionSettings, ParameterEstimate
-from needle_identification.friction.recursive import LiveFriction
+from needle_identification import (
+    FrictionSettings,
+    identify_friction,
+    LiveRecording,
+    read_friction_recording,
+    Recording,
+    RecordingError,
+)
+from needle_identification.bags.writer import BagWriter
+from needle_ros.contract import BASE_WRENCH, JOINT_STATES
 import numpy as np
+from numpy.testing import assert_array_equal
 import pytest
 from support.samples import IDEAL, simulated, TRUTH
 
@@ -15,46 +27,80 @@ LEGS = tuple(
     leg for speed in (3e-3, 8e-3) for leg in ((0.0, 0.3), (speed, 1.2), (0.0, 0.3), (-speed, 1.2))
 )
 RECORDING = simulated(LEGS, sensor=IDEAL)
-STAMPS = np.round(RECORDING.time * 1e9).astype(int) + 1_700_000_000_000_000_000
-SAMPLES = list(
-    zip(STAMPS.tolist(), RECORDING.depth, RECORDING.velocity, RECORDING.force, strict=True)
-)
+BEGIN = 1_700_000_000_000_000_000
+
+#: Stamp [ns], depth [m], velocity [m/s] and force [N].
+Sample = tuple[int, float, float, float]
+
+
+def samples_of(recording: Recording) -> list[Sample]:
+    stamps = np.round(recording.time * 1e9).astype(int) + BEGIN
+    velocity = np.zeros(len(stamps)) if recording.velocity is None else recording.velocity
+    columns = recording.depth, velocity, recording.force
+    return list(zip(stamps.tolist(), *(one.tolist() for one in columns), strict=True))
+
+
+SAMPLES = samples_of(RECORDING)
+
+
+def fed(
+    samples: Iterable[Sample] = SAMPLES,
+    *,
+    window: float = 1e3,
+    shift: int = 0,
+    velocities: bool = True,
+) -> LiveRecording:
+    """Return a live recording with samples, and with the motion at a shifted time [ns]."""
+    live = LiveRecording(window)
+    feed(live, samples, shift=shift, velocities=velocities)
+    return live
 
 
 def feed(
-    live: LiveFriction,
-    samples: list[tuple[int, float, float, float]] = SAMPLES,
-    shift: int = 0,
-    velocities: bool = True,
+    live: LiveRecording, samples: Iterable[Sample], *, shift: int = 0, velocities: bool = True
 ) -> None:
-    """Feed a recording as two topics, with a small delay of the motion."""
     for stamp, depth, velocity, force in samples:
         live.take_force(stamp, force)
         live.take_motion(stamp + shift, depth, velocity if velocities else None)
 
 
-def make() -> LiveFriction:
-    """Build a live identification without forgetting."""
-    return LiveFriction(FrictionSettings(), 1e6)
-
-
-def values(live: LiveFriction) -> dict[str, ParameterEstimate]:
-    return {one.name: one for one in live.estimate()}
-
-
-def check(live: LiveFriction, tolerance: float) -> None:
-    """Compare with the simulated parameters."""
-    found = values(live)
+def check(live: LiveRecording, tolerance: float) -> None:
+    """Compare the identified friction with the simulated parameters."""
+    found = identify_friction(live.recording())
     for name in ('coulomb_friction', 'viscous_friction'):
-        assert found[name].determined
         assert found[name].value == pytest.approx(getattr(TRUTH, name), rel=tolerance)
 
 
+@pytest.mark.parametrize('kind', [NoiseKind(), *(FURTHER[one].kind for one in (
+    'low-pass of 8 Hz', 'filtered velocity', 'play of the encoder', 'gravity',
+))])  # fmt: skip
+def test_live_friction_is_that_of_a_bag(tmp_path: Path, kind: NoiseKind) -> None:
+    """The same samples of two topics: equal recordings, and so equal parameters and warnings."""
+    made, _ = recorded(kind, np.random.default_rng(2))
+    samples = samples_of(made)
+    with BagWriter(tmp_path / 'bag') as bag:
+        for topic in (JOINT_STATES, BASE_WRENCH):
+            bag.add_topic(f'/{topic.name}', topic.type_name)
+        write = {topic: topic.template().serialize for topic in (JOINT_STATES, BASE_WRENCH)}
+        for stamp, depth, velocity, force in samples:
+            speed = nan if kind.positions_only else velocity
+            motion = write[JOINT_STATES](stamp, depth, 0.0, speed, 0.0, 0.0, 0.0)
+            bag.write(f'/{JOINT_STATES.name}', motion, stamp)
+            wrench = write[BASE_WRENCH](stamp, 0.0, force, 0.0, 0.0, 0.0, 0.0)
+            bag.write(f'/{BASE_WRENCH.name}', wrench, stamp)
+    read = read_friction_recording(tmp_path / 'bag')
+    live = fed(samples, velocities=not kind.positions_only).recording()
+    # The rests of these recordings are shorter than the margin: nothing is discarded.
+    assert_array_equal(live.time, read.time)
+    assert_array_equal(live.depth, read.depth)
+    assert_array_equal(live.force, read.force)
+    found, expected = identify_friction(live), identify_friction(read)
+    assert found.parameters == expected.parameters
+    assert found.warnings == expected.warnings
+
+
 def test_simulated_friction_is_recovered() -> None:
-    """Equal stamps are paired directly."""
-    live = make()
-    assert live.estimate() == ()
-    feed(live)
+    live = fed()
     assert live.samples == len(SAMPLES)
     assert live.dropped == {}
     # An ideal sensor: the error is the transition between the regimes of the filter.
@@ -63,18 +109,21 @@ def test_simulated_friction_is_recovered() -> None:
 
 def test_motion_between_the_stamps_of_the_force_is_interpolated() -> None:
     """A motion sampled 1.3 ms before the force gives the same friction."""
-    live = make()
-    feed(live, shift=-1_300_000)
-    assert live.samples >= len(SAMPLES) - 2
     # The interpolated velocity is wrong only in the ramps, where no sample is used.
-    check(live, 0.02)
+    check(fed(shift=-1_300_000), 0.02)
 
 
 def test_positions_without_velocity_are_differentiated() -> None:
-    """The velocity at the middle of two positions is their slope."""
-    live = make()
-    feed(live, velocities=False)
-    check(live, 0.02)
+    check(fed(velocities=False), 0.02)
+
+
+def test_samples_between_two_identifications_are_added() -> None:
+    """The order of samples and recordings does not matter."""
+    live = LiveRecording(1e3)
+    for k in range(0, len(SAMPLES), 1000):
+        feed(live, SAMPLES[k : k + 1000])
+        live.recording()
+    assert_array_equal(live.recording().force, fed().recording().force)
 
 
 @pytest.mark.parametrize(
@@ -83,69 +132,86 @@ def test_positions_without_velocity_are_differentiated() -> None:
 )
 def test_implausible_values_are_discarded_and_counted(value: float, kind: str) -> None:
     """A temporary failure of a sensor does not change the estimate."""
-    live = make()
-    for k, (stamp, depth, velocity, force) in enumerate(SAMPLES):
-        live.take_force(stamp, value if k % 50 == 0 else force)
-        live.take_motion(stamp, depth, value if k % 75 == 0 else velocity)
-    assert live.dropped[kind] == -(-len(SAMPLES) // 50) - (-len(SAMPLES) // 75)
+    live = fed(
+        (stamp, value if k % 75 == 0 else depth, velocity, value if k % 50 == 0 else force)
+        for k, (stamp, depth, velocity, force) in enumerate(SAMPLES)
+    )
+    assert live.dropped == {kind: -(-len(SAMPLES) // 50) + -(-len(SAMPLES) // 75)}
     check(live, 0.02)
 
 
-def test_late_and_repeated_stamps_are_discarded() -> None:
-    live = make()
+def test_late_and_repeated_stamps_are_reported() -> None:
+    """A late sample is sorted; of two with the same stamp the first one is used."""
+    live = LiveRecording(1e3)
     for k, (stamp, depth, velocity, force) in enumerate(SAMPLES):
-        live.take_motion(stamp, depth, velocity)
-        live.take_force(stamp, force)
+        feed(live, [(stamp, depth, velocity, force)])
         if k % 10 == 0:
             live.take_force(stamp, 1e3)
-            live.take_motion(stamp - 5_000_000, depth, 10.0)
-    assert live.dropped == {'out of order': 2 * -(-len(SAMPLES) // 10)}
+            live.take_motion(stamp - 5_000_000, depth - 5e-3 * velocity, velocity)
+    recording = live.recording()
+    text = '; '.join(recording.losses)
+    assert 'base_wrench with the stamp of another' in text
+    assert 'joint_states out of order' in text
     check(live, 0.01)
 
 
-def test_a_backward_clock_jump_restarts_the_estimation() -> None:
-    """The result is the result of the new stamps only."""
-    live, fresh = make(), make()
-    feed(live)
-    earlier = [(stamp - 3600 * 10**9, *others) for stamp, *others in SAMPLES]
+def test_a_backward_clock_jump_restarts_the_recording() -> None:
+    """Only the new stamps are used."""
+    earlier = [(stamp - 3600 * 10**9, y, v, f) for stamp, y, v, f in SAMPLES]
+    live = fed()
     feed(live, earlier)
-    feed(fresh, earlier)
-    assert live.dropped['clock set back'] >= 1
-    assert live.samples == pytest.approx(fresh.samples, abs=2)
+    assert live.dropped == {'clock set back': 1}
+    recording = live.recording()
+    assert recording.time[-1] == pytest.approx(RECORDING.time[-1] - RECORDING.time[0], abs=0.02)
     check(live, 0.01)
 
 
-def test_force_within_a_gap_of_the_motion_is_not_paired() -> None:
+def test_force_within_a_gap_of_the_motion_is_not_used() -> None:
     """The motion is unknown during a gap of the encoder."""
-    live = make()
+    live = LiveRecording(1e3)
     gap = range(400, 500)
     for k, (stamp, depth, velocity, force) in enumerate(SAMPLES):
         live.take_force(stamp, force)
         if k not in gap:
             live.take_motion(stamp, depth, velocity)
-    assert live.dropped == {'no motion at their time': len(gap)}
+    assert 'not covered' in '; '.join(live.recording().losses)
     check(live, 0.02)
 
 
-def test_the_buffer_is_bounded_if_one_topic_is_missing() -> None:
-    """Force samples without motion are buffered up to a limit."""
-    live = make()
-    for k in range(30_000):
+def test_memory_and_time_are_those_of_the_last_motions() -> None:
+    """Rests are discarded beyond the margin of 1 s, motions beyond the window."""
+    step, window = 0.005, 4.0
+    live = LiveRecording(window)
+    end = 0.0
+    for speed, duration in [(4e-3, 10.0), (0.0, 100.0), (-5e-3, 3.0), (0.0, 50.0)]:
+        for time in end + np.arange(0.0, duration, step):
+            feed(live, [(BEGIN + round(1e9 * time), 0.1, speed, 0.5 * np.sign(speed))])
+        end += duration
+        recording = live.recording()
+    # The last motion, and a second of the first one. Margins: three are at rest, one is in the
+    # first motion, and one is before the newest sample.
+    assert len(recording.time) * step == pytest.approx(window + 5 * 1.0, abs=0.1)
+    moving = np.flatnonzero(recording.velocity)
+    assert len(moving) * step == pytest.approx(window + 1.0, abs=0.1)
+
+
+def test_missing_topic_is_named() -> None:
+    live = LiveRecording(10.0)
+    for k in range(30):
         live.take_force(1_000_000 * (k + 1), 1.0)
-    assert len(live._force) == 20_000
     assert live.samples == 0
-    assert live.estimate() == ()
+    with pytest.raises(RecordingError, match='no samples of joint_states'):
+        live.recording()
 
 
-@pytest.mark.parametrize(
-    ('settings', 'forgetting', 'complaint'),
-    [
-        (FrictionSettings(), 0.0, 'forgetting must be finite and > 0'),
-        (FrictionSettings(estimator='huber'), 60.0, 'estimator ordinary'),
-    ],
-)
-def test_invalid_settings_are_rejected_at_once(
-    settings: FrictionSettings, forgetting: float, complaint: str
-) -> None:
-    with pytest.raises(ParameterError, match=complaint):
-        LiveFriction(settings, forgetting)
+@pytest.mark.parametrize('window', [0.0, -1.0, nan, inf])
+def test_invalid_window_is_rejected(window: float) -> None:
+    with pytest.raises(ParameterError, match='window must be finite and > 0'):
+        LiveRecording(window)
+
+
+def test_all_settings_are_those_of_recordings() -> None:
+    """Terms of the whole recording, and every estimator."""
+    settings = FrictionSettings(terms=('coulomb', 'viscous', 'drift'), estimator='huber')
+    found = identify_friction(fed().recording(), settings)
+    assert found['force_drift'].determined

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The newest samples of running topics as a recording."""
+
+from collections import Counter
+from math import inf, isfinite
+from typing import Final
+
+from needle_dynamics.arrays import IntArray
+from needle_identification.errors import RecordingError
+from needle_identification.recordings.reading import friction_recording
+from needle_identification.recordings.recording import Recording
+from needle_identification.recordings.samples import position_and_velocity, Samples, Series
+from needle_ros.contract import BASE_WRENCH, JOINT_STATES
+from needle_ros.errors import ParameterError
+from needle_ros.timing import NANOSECONDS
+import numpy as np
+
+#: Largest plausible force [N], and depth [m] or velocity [m/s].
+_LARGEST: Final = {BASE_WRENCH.name: 1e4, JOINT_STATES.name: 100.0}
+_SET_BACK: Final = NANOSECONDS  # backward step of a clock set back, not of a late message [ns]
+_MARGIN: Final = NANOSECONDS  # time before and after a motion that is kept [ns]
+_MOVES: Final = 0.05  # smallest speed of a motion, as a fraction of the usual largest speed
+
+
+class LiveRecording:
+    """
+    The newest samples of running topics, as a recording of their last motions.
+
+    Samples more than a second away from any motion are not kept. Invalid samples are counted
+    in ``dropped``. A clock that is set back discards all earlier samples.
+
+    Parameters
+    ----------
+    window : float
+        Duration of the motion that is kept [s].
+
+    Raises
+    ------
+    ParameterError
+        If the duration is not finite and positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from needle_identification import identify_friction, LiveRecording
+    >>> live = LiveRecording(window=10.0)
+    >>> for time in np.arange(0.0, 20.0, 0.004):
+    ...     velocity = 0.008 * np.sin(2.0 * time) + 0.006 * np.sin(3.1 * time)
+    ...     stamp, depth = round(1e9 * time), 0.1 - 0.004 * np.cos(2.0 * time)
+    ...     live.take_motion(stamp, depth, velocity)
+    ...     live.take_force(stamp, 0.56 * np.sign(velocity) + 300.0 * velocity)
+    >>> live.recording()
+    <Recording the running topics: 2750 samples in 11 s>
+    >>> print(f'{identify_friction(live.recording())["coulomb_friction"].value:.3f} N')
+    0.560 N
+
+    """
+
+    path: Final = 'the running topics'
+
+    def __init__(self, window: float) -> None:
+        if not 0.0 < window < inf:
+            raise ParameterError(f'window must be finite and > 0, got {window!r}')
+        self._window = window * NANOSECONDS
+        #: Number of discarded samples by reason.
+        self.dropped: Counter[str] = Counter()
+        #: Discarded and repaired data of the last recording.
+        self.losses: list[str] = []
+        self._restart()
+
+    def _restart(self) -> None:
+        self._series = {BASE_WRENCH.name: Series(1), JOINT_STATES.name: Series(3)}
+        #: Added samples: stamps and values.
+        self._added: dict[str, tuple[list[int], list[tuple[float, ...]]]] = {
+            name: ([], []) for name in self._series
+        }
+        self._newest = 0
+        self._counts = dict.fromkeys(self._series, 0)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples since the start of the topic that has fewer of them."""
+        return min(self._counts.values())
+
+    def take_motion(self, stamp: int, depth: float, velocity: float | None = None) -> None:
+        """Add depth [m] and, if measured, velocity [m/s] at a stamp [ns]."""
+        known = velocity is not None and abs(velocity) <= _LARGEST[JOINT_STATES.name]
+        speed = velocity if known and velocity is not None else 0.0
+        self._take(JOINT_STATES.name, stamp, (depth, speed, float(known)))
+
+    def take_force(self, stamp: int, force: float) -> None:
+        """Add the base force on the needle [N], positive into the tissue, at a stamp [ns]."""
+        self._take(BASE_WRENCH.name, stamp, (force,))
+
+    def _take(self, name: str, stamp: int, values: tuple[float, ...]) -> None:
+        if not abs(values[0]) <= _LARGEST[name]:
+            self.dropped['implausible' if isfinite(values[0]) else 'not finite'] += 1
+            return
+        if stamp < self._newest - _SET_BACK:
+            self._restart()
+            self.dropped['clock set back'] += 1
+            return
+        self._newest = max(self._newest, stamp)
+        self._counts[name] += 1
+        stamps, all_values = self._added[name]
+        stamps.append(stamp)
+        all_values.append(values)
+
+    def recording(self) -> Recording:
+        """Return the kept samples; `RecordingError` if force and motion do not overlap in time."""
+        self.losses = []
+        for name, series in self._series.items():
+            stamps, values = self._added[name]
+            if stamps:
+                series.add(np.array(stamps, dtype=np.int64), np.array(values))
+                series.compact()
+                self._added[name] = [], []
+            if len(series.stamps) < 2:
+                raise RecordingError(f'{self.path} have no samples of {name}')
+            self.losses += series.losses(name)
+        self._discard()
+        force, motion = (
+            Samples(name, series.stamps, series.values, np.zeros(1, dtype=np.int64))
+            for name, series in self._series.items()
+        )
+        return friction_recording(self, force, position_and_velocity(motion, self))
+
+    def _discard(self) -> None:
+        """Discard the samples that are far from any motion, or older than the window."""
+        moving = self._moving()
+        steps = np.diff(moving)[::-1]
+        elapsed = np.cumsum(np.where(steps <= _MARGIN, steps, 0))
+        count = min(int(np.searchsorted(elapsed, self._window)) + 1, len(moving))
+        moving = moving[len(moving) - count :]
+        for series in self._series.values():
+            stamps = series.stamps
+            after = np.searchsorted(moving, stamps)
+            distances = (
+                np.abs(stamps - moving[np.maximum(after - 1, 0)]),
+                np.abs(stamps - moving[np.minimum(after, count - 1)]),
+            )
+            series.keep(np.minimum(*distances) <= _MARGIN)
+
+    def _moving(self) -> IntArray:
+        """Return the stamps of the samples in motion [ns], and the newest one."""
+        motion = self._series[JOINT_STATES.name]
+        depth, velocity, known = motion.values.T
+        slope = np.gradient(depth, (motion.stamps - motion.stamps[0]) / NANOSECONDS)
+        speed = np.abs(np.where(known > 0.0, velocity / np.maximum(known, 1e-9), slope))
+        moves = speed > _MOVES * np.quantile(speed, 0.99)
+        moves[-1] = True
+        return np.asarray(motion.stamps[moves])
