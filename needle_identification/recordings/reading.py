@@ -25,7 +25,7 @@ from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import samples, tables, TIMES
 from needle_identification.recordings.recording import IndentationRecording, Recording
-from needle_identification.recordings.samples import are_gaps, Origin, Samples
+from needle_identification.recordings.samples import are_gaps, SampleOrigin, Samples
 from needle_ros import wire
 from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import MessageError, ParameterError
@@ -153,7 +153,7 @@ def read_friction_recording(
 
 
 def friction_recording(
-    origin: Origin, force: Samples, motion: Samples, configuration: str = ''
+    origin: SampleOrigin, force: Samples, motion: Samples, configuration: str = ''
 ) -> Recording:
     """Return force, and depth with its velocity, if measured, on the time base of the force."""
     times, forces, motions, clock_offset = merge(origin, force, motion)
@@ -315,7 +315,7 @@ def span_of(stamps: IntArray) -> str:
 
 
 def merge(
-    bag: Origin, force: Samples, motion: Samples
+    bag: SampleOrigin, force: Samples, motion: Samples
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return time [s], force, motion at the stamps of the force, and its clock offset [s]."""
     offset = _clock_offset(bag, force, motion)
@@ -340,7 +340,7 @@ def merge(
     return time, force.values[covered][distinct], np.column_stack(columns), offset * 1e-9
 
 
-def _clock_offset(bag: Origin, force: Samples, motion: Samples) -> int:
+def _clock_offset(bag: SampleOrigin, force: Samples, motion: Samples) -> int:
     """Estimate the clock offset of force to motion [ns]; 0 if explained by latency."""
     quantiles = [
         np.quantile(samples.latency, (0.05, 0.5), method='lower') for samples in (force, motion)

@@ -269,7 +269,7 @@ def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> 
     return _Vector(*axes)
 
 
-class Origin(Protocol):
+class SampleOrigin(Protocol):
     """Bag or running topics: its name for messages, and its discarded and repaired data."""
 
     losses: list[str]
@@ -359,7 +359,7 @@ def are_gaps(steps: IntArray | FloatArray) -> BoolArray:
     return np.asarray(steps > _GAP * np.median(steps))
 
 
-def position_and_velocity(samples: Samples, bag: Origin) -> Samples:
+def position_and_velocity(samples: Samples, bag: SampleOrigin) -> Samples:
     """Return the position and, if measured, the velocity; a velocity alone is integrated."""
     topic, _, values, _ = samples
     if values.shape[1] == 1:
@@ -382,7 +382,7 @@ def position_and_velocity(samples: Samples, bag: Origin) -> Samples:
     return samples._replace(values=values[:, :1])
 
 
-def _from_velocity(samples: Samples, bag: Origin) -> Samples:
+def _from_velocity(samples: Samples, bag: SampleOrigin) -> Samples:
     bag.losses.append(f'{samples.topic} has no position: depth is the integral of speed from 0')
     time = (samples.stamps - samples.stamps[0]) * 1e-9
     velocity = samples.values[:, 0]

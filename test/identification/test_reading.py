@@ -185,8 +185,8 @@ def test_unusable_samples_are_discarded_and_counted(tmp_path: Path) -> None:
     read = read_friction_recording(small_bag(tmp_path / 'bag', wrenches, motions))
     assert_allclose(read.time, [t / 100.0 for t in range(11) if t != 3], atol=1e-12)
     assert read.losses == (
-        '1 of /ft out of order, sorted by stamp',
         '1 of /ft not finite, left out',
+        '1 of /ft out of order, sorted by stamp',
         '1 of /ft with the stamp of another, left out',
         '1 of /joints not finite, left out',
     )
