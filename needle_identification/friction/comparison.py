@@ -107,13 +107,18 @@ class _Comparison(NamedTuple):
         if not trial.determined or trial.p_value >= SIGNIFICANCE:
             return trial
         which = list(range(design.terms, design.terms + len(trial.values)))
+        ends = np.cumsum([len(columns_of([term], settings)) for term in more])
         # Autocorrelated noise resembles many terms. Too few samples determine no other term.
         with suppress(IdentificationError):
             other = design.solve((*settings.terms, *more), settings.estimator)
             if other.determined[which].all():
                 values, errors = other.values[which], other.errors[which]
                 growth = other.memory.inflation[: design.terms].max() if other.memory else 1.0
-                return Trial(values, errors, True, trial.misfit, wald_test(other, which), growth)
+                # Two terms that explain all slow noise are missing if each of them is
+                # (intersection-union test).
+                parts = np.split(which, ends[:-1] if growth < _LIKE_MEMORY else [])
+                p_value = max(wald_test(other, part.tolist()) for part in parts)
+                return Trial(values, errors, True, trial.misfit, p_value, growth)
         return trial._replace(determined=False, p_value=1.0)
 
     def _judged(self, more: tuple[str, ...], trial: Trial, p_value: float) -> CandidateFit:

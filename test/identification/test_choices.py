@@ -330,3 +330,11 @@ def test_pooled_recordings_reveal_a_drift_too_small_for_each_recording() -> None
     others = [one for one in found if not advised(one)]
     assert 'add the term drift' in summarize(others).warnings[0]
     assert not alone or len(summarize(found).warnings) == 1
+
+
+@pytest.mark.parametrize('number', [50, 152, 240, 252])
+def test_two_terms_are_advised_only_if_each_is_needed(number: int) -> None:
+    """Outliers of one sign are an offset: no second term explains them, also not beside it."""
+    name = 'outliers of one sign'
+    recording, _ = recorded(FURTHER[name].kind, np.random.default_rng([2014, number, 21]))
+    assert set(advised(identify_friction(recording))) <= {'offset'}
