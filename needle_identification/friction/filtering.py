@@ -32,6 +32,7 @@ _CLEARLY: Final = 5.0  # speed above which the needle moves [standard deviations
 _KEPT: Final = 8.0  # samples per period of the cutoff that are kept after the filter
 _LONGER: Final = 3  # hold time at a limit of the sensor over the longest at other values
 _MOST_CUT_OFF: Final = 0.5  # largest fraction of samples that may count as saturated
+_FEWEST: Final = 6  # samples of a spline of order 5
 _LARGEST_GRID: Final = 10.0  # resampled points per sample; more are mostly gaps
 
 
@@ -70,7 +71,7 @@ def filter_signals(
 ) -> FilteredSignals:
     """Filter force and motion, the motion also by a low-pass filter of the force [s]."""
     time = recording.time
-    if len(time) < 3:
+    if len(time) < _FEWEST:
         raise IdentificationError(f'too short: {len(time)} samples')
     steps = np.diff(time)
     period = float(np.median(steps))
@@ -85,7 +86,7 @@ def filter_signals(
     lost |= np.interp(grid, time, cut.astype(np.float64)) > 0.0
     # A filter longer than the recording may exceed the memory.
     half = ceil(min(HALF_LENGTH / settings.cutoff / period, len(grid)))
-    if len(grid) <= 4 * half:
+    if len(grid) < max(4 * half + 1, _FEWEST):
         raise IdentificationError(
             f'must last > {4.0 * HALF_LENGTH / settings.cutoff:.3g} s for a filter of '
             f'{settings.cutoff:g} Hz, lasts {duration:.3g} s: the cutoff must be above '

@@ -18,7 +18,8 @@ import numpy as np
 #: Largest plausible force [N], and depth [m] or velocity [m/s].
 _LARGEST: Final = {BASE_WRENCH.name: 1e4, JOINT_STATES.name: 100.0}
 _SET_BACK: Final = NANOSECONDS  # backward step of a clock set back, not of a late message [ns]
-_MARGIN: Final = NANOSECONDS  # time before and after a motion that is kept [ns]
+_MARGIN: Final = NANOSECONDS  # time before a motion that is kept [ns]
+_WITH_RESTS: Final = 3  # largest duration with rests, as a multiple of the window
 _MOVES: Final = 0.05  # smallest speed of a motion, as a fraction of the usual largest speed
 
 
@@ -26,13 +27,13 @@ class LiveRecording:
     """
     The newest samples of running topics, as a recording of their last motions.
 
-    Samples more than a second away from any motion are not kept. Invalid samples are counted
-    in ``dropped``. A clock that is set back discards all earlier samples.
+    Invalid samples are counted in ``dropped``. A clock that is set back discards all earlier
+    samples.
 
     Parameters
     ----------
     window : float
-        Duration of the motion that is kept [s].
+        Duration of the motion that is kept [s]; with rests, at most three times as long.
 
     Raises
     ------
@@ -115,10 +116,11 @@ class LiveRecording:
                 series.add(np.array(stamps, dtype=np.int64), np.array(values))
                 series.compact()
                 self._added[name] = [], []
-            if len(series.stamps) < 2:
-                raise RecordingError(f'{self.path} have no samples of {name}')
             self.losses += series.losses(name)
         self._discard()
+        for name, series in self._series.items():
+            if len(series.stamps) < 2:
+                raise RecordingError(f'{self.path} have no samples of {name}')
         force, motion = (
             Samples(name, series.stamps, series.values, np.zeros(1, dtype=np.int64))
             for name, series in self._series.items()
@@ -126,24 +128,22 @@ class LiveRecording:
         return friction_recording(self, force, position_and_velocity(motion, self))
 
     def _discard(self) -> None:
-        """Discard the samples that are far from any motion, or older than the window."""
+        """Discard the samples before the last motions."""
         moving = self._moving()
+        if not len(moving):
+            return
         steps = np.diff(moving)[::-1]
         elapsed = np.cumsum(np.where(steps <= _MARGIN, steps, 0))
         count = min(int(np.searchsorted(elapsed, self._window)) + 1, len(moving))
-        moving = moving[len(moving) - count :]
+        begin = max(int(moving[-count]) - _MARGIN, self._newest - _WITH_RESTS * self._window)
         for series in self._series.values():
-            stamps = series.stamps
-            after = np.searchsorted(moving, stamps)
-            distances = (
-                np.abs(stamps - moving[np.maximum(after - 1, 0)]),
-                np.abs(stamps - moving[np.minimum(after, count - 1)]),
-            )
-            series.keep(np.minimum(*distances) <= _MARGIN)
+            series.keep(series.stamps >= begin)
 
     def _moving(self) -> IntArray:
         """Return the stamps of the samples in motion [ns], and the newest one."""
         motion = self._series[JOINT_STATES.name]
+        if len(motion.stamps) < 2:
+            return motion.stamps
         depth, velocity, known = motion.values.T
         slope = np.gradient(depth, (motion.stamps - motion.stamps[0]) / NANOSECONDS)
         speed = np.abs(np.where(known > 0.0, velocity / np.maximum(known, 1e-9), slope))

@@ -2,10 +2,13 @@
 """Running topics as a recording: the same friction as from a bag, in any order of messages."""
 
 from collections.abc import Iterable
+from contextlib import suppress
 from math import inf, nan
 from pathlib import Path
 
 from benchmarks.noises import FURTHER, NoiseKind, recorded
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from needle_dynamics import ParameterError
 from needle_identification import (
     FrictionSettings,
@@ -17,6 +20,7 @@ from needle_identification import (
 )
 from needle_identification.bags.writer import BagWriter
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES
+from needle_ros.errors import NeedleError
 import numpy as np
 from numpy.testing import assert_array_equal
 import pytest
@@ -179,20 +183,40 @@ def test_force_within_a_gap_of_the_motion_is_not_used() -> None:
 
 
 def test_memory_and_time_are_those_of_the_last_motions() -> None:
-    """Rests are discarded beyond the margin of 1 s, motions beyond the window."""
+    """Motions beyond the window are discarded, and all samples beyond three windows."""
     step, window = 0.005, 4.0
     live = LiveRecording(window)
     end = 0.0
-    for speed, duration in [(4e-3, 10.0), (0.0, 100.0), (-5e-3, 3.0), (0.0, 50.0)]:
+    lasts = []
+    for speed, duration in [(4e-3, 10.0), (0.0, 2.0), (-5e-3, 3.0), (0.0, 50.0)]:
         for time in end + np.arange(0.0, duration, step):
             feed(live, [(BEGIN + round(1e9 * time), 0.1, speed, 0.5 * np.sign(speed))])
         end += duration
         recording = live.recording()
-    # The last motion, and a second of the first one. Margins: three are at rest, one is in the
-    # first motion, and one is before the newest sample.
-    assert len(recording.time) * step == pytest.approx(window + 5 * 1.0, abs=0.1)
-    moving = np.flatnonzero(recording.velocity)
-    assert len(moving) * step == pytest.approx(window + 1.0, abs=0.1)
+        lasts.append(len(recording.time) * step)
+    # With a margin of 1 s before it: the window; with the rest; a second of the first motion, the
+    # rest and the last motion; three windows.
+    assert lasts == pytest.approx(
+        [window + 1.0, window + 3.0, window + 3.0, 3.0 * window], abs=0.1
+    )
+
+
+numbers = st.floats(-0.2, 0.2) | st.sampled_from([0.0, nan, inf, -1e300])
+
+
+@given(st.lists(st.tuples(st.integers(-2, 300), numbers, numbers, numbers), max_size=80))
+@settings(max_examples=60)
+def test_any_samples_give_a_recording_or_one_error(
+    samples: list[tuple[int, float, float, float]],
+) -> None:
+    """Few, uneven, late, repeated or invalid samples: no other error, and no warning of NumPy."""
+    live, stamp = LiveRecording(1.0), BEGIN
+    for steps, depth, velocity, force in samples:
+        stamp += 1_000_000 * steps
+        live.take_motion(stamp, depth, velocity)
+        live.take_force(stamp, force)
+    with suppress(NeedleError):
+        identify_friction(live.recording())
 
 
 def test_missing_topic_is_named() -> None:
