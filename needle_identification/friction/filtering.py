@@ -71,7 +71,7 @@ def filter_signals(
 ) -> FilteredSignals:
     """Filter force and motion, the motion also by a low-pass filter of the force [s]."""
     time = recording.time
-    if len(time) < _FEWEST:
+    if len(time) < 3:
         raise IdentificationError(f'too short: {len(time)} samples')
     steps = np.diff(time)
     period = float(np.median(steps))
@@ -86,12 +86,14 @@ def filter_signals(
     lost |= np.interp(grid, time, cut.astype(np.float64)) > 0.0
     # A filter longer than the recording may exceed the memory.
     half = ceil(min(HALF_LENGTH / settings.cutoff / period, len(grid)))
-    if len(grid) < max(4 * half + 1, _FEWEST):
+    if len(grid) <= 4 * half:
         raise IdentificationError(
             f'must last > {4.0 * HALF_LENGTH / settings.cutoff:.3g} s for a filter of '
             f'{settings.cutoff:g} Hz, lasts {duration:.3g} s: the cutoff must be above '
             f'{4.0 * HALF_LENGTH / duration:.3g} Hz'
         )
+    if len(grid) < _FEWEST:
+        raise IdentificationError(f'too short: {len(grid)} periods of {period:.3g} s')
     taps = filter_taps(settings.cutoff, period)
     of_motion = np.convolve(taps, low_pass_taps(low_pass, period)) if low_pass else taps
     step = max(1, int(1.0 / (_KEPT * settings.cutoff * period)))

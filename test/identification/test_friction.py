@@ -506,6 +506,9 @@ def test_the_fit_has_the_reported_residual() -> None:
     assert np.count_nonzero(fit.used) == found.samples
 
 
+TENS = np.arange(0.0, 50.0, 10.0)
+
+
 def jump(recording: Recording) -> Recording:
     """Insert a clock jump in the middle, as between simulated and real stamps."""
     return replace(recording, time=recording.time + np.where(recording.time < 4.0, 0.0, 1e9))
@@ -518,6 +521,7 @@ def jump(recording: Recording) -> Recording:
         (law(varied, duration=0.5), 'steady motion above 1e-05 m/s must last'),
         (law(varied, duration=0.04), 'must last > 0.048 s for a filter of 30 Hz'),
         (law(varied, duration=0.004), 'too short: 1 samples'),
+        (Recording(name='law', time=TENS, depth=TENS, force=TENS), 'too short: 5 periods of 10 s'),
         (
             replace(law(varied), force=np.zeros(2000)),
             'force must vary, got 0 N throughout: choose another axis or topic',
@@ -528,7 +532,16 @@ def jump(recording: Recording) -> Recording:
         ),
         (jump(law(varied)), r'stamps too uneven: 2000 samples in 1e\+09 s'),
     ],
-    ids=['rest', 'little motion', 'short', 'one sample', 'no force', 'noise', 'stamps'],
+    ids=[
+        'rest',
+        'little motion',
+        'short',
+        'one sample',
+        'five samples',
+        'no force',
+        'noise',
+        'stamps',
+    ],
 )
 def test_an_unusable_recording_is_rejected_with_a_reason(
     recording: Recording, complaint: str
