@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from math import inf
+from operator import attrgetter
 import os
 from typing import Final
 
@@ -23,6 +24,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 _CHUNK: Final = 256  #: largest number of runs per task, enough to fill all vector lanes
+
+#: Constants of the lanes that are attributes of `NeedleParameters`; read after the first three.
+_OWN: Final = [one for one in lanes.Constants._fields if hasattr(NeedleParameters, one)]
+_READ: Final = attrgetter('minimum_depth', 'reach', 'hub_stop', *_OWN)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -285,17 +290,14 @@ def _fits(p: NeedleParameters) -> bool:
 
 def lane_constants(each: Sequence[NeedleParameters]) -> FloatArray:
     """Return the rows of `lanes.Constants`, shape (runs, 13)."""
-    return np.array(
-        [
-            lanes.Constants(
-                **{name: getattr(p, name) for name in lanes.Constants._fields if hasattr(p, name)},
-                lowest=p.minimum_depth - ROUNDING * p.length,
-                highest=p.reach * p.length,
-                stop=p.length if p.hub_stop else inf,
-            )
-            for p in each
-        ]
-    )
+    values = np.array([_READ(p) for p in each], dtype=np.float64).T
+    columns = dict(zip(_OWN, values[3:], strict=True))
+    least, reach, stops = values[:3]
+    length = columns['length']
+    columns['lowest'] = least - ROUNDING * length
+    columns['highest'] = reach * length
+    columns['stop'] = np.where(stops, length, inf)
+    return np.column_stack([columns[name] for name in lanes.Constants._fields])
 
 
 @cache
