@@ -4,6 +4,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
+from math import nan
 import sys
 from time import monotonic
 from typing import Any, ClassVar, Final
@@ -140,6 +142,10 @@ class IdentificationNode(BaseNode):
         self.settings('stiffness.', StiffnessSettings)
         self.settings('', IdentificationSettings)
         self._is_live = bool(self.get_parameter('live').value)
+        if self._is_live:
+            # The first identification imports these: not while samples arrive.
+            import_module('scipy.interpolate')
+            import_module('scipy.stats')
         self._force_axis = signed_axis(self.text('force_axis'), 'force_axis')
         self._joint = signed(self.text('motion_axis') or contract.INSERTION)
         if len(self.get_parameter('axes').value) != 2:
@@ -163,6 +169,7 @@ class IdentificationNode(BaseNode):
         if self._bags:
             self._identify()
         if self._is_live:
+            self._doubts = ''
             self._live = LiveRecording(self.settings('', IdentificationSettings).window)
             self._listening = (
                 self.listen(contract.JOINT_STATES, self._on_motion, qos=_ALL),
@@ -278,7 +285,7 @@ class IdentificationNode(BaseNode):
         at = reading.names.index(joint)
         position, velocity, _ = reading.values
         if len(position) > at:
-            along = sign * velocity[at] if len(velocity) > at else None
+            along = sign * velocity[at] if len(velocity) > at else nan
             self._live.take_motion(reading.stamp, sign * position[at], along)
 
     def _on_force(self, reading: Reading) -> None:

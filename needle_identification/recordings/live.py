@@ -2,7 +2,7 @@
 """The newest samples of running topics as a recording."""
 
 from collections import Counter
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from typing import Final
 
 from needle_dynamics.arrays import IntArray
@@ -65,7 +65,7 @@ class LiveRecording:
         self._window = window * NANOSECONDS
         #: Number of discarded samples by reason.
         self.dropped: Counter[str] = Counter()
-        #: Discarded and repaired data of the last recording.
+        #: Discarded and repaired data of the last recording; stamps since the start.
         self.losses: list[str] = []
         self._restart()
 
@@ -83,11 +83,10 @@ class LiveRecording:
         """Number of samples since the start of the topic that has fewer of them."""
         return min(self._counts.values())
 
-    def take_motion(self, stamp: int, depth: float, velocity: float | None = None) -> None:
-        """Add depth [m] and, if measured, velocity [m/s] at a stamp [ns]."""
-        known = velocity is not None and abs(velocity) <= _LARGEST[JOINT_STATES.name]
-        speed = velocity if known and velocity is not None else 0.0
-        self._take(JOINT_STATES.name, stamp, (depth, speed, float(known)))
+    def take_motion(self, stamp: int, depth: float, velocity: float = nan) -> None:
+        """Add depth [m] and velocity [m/s], NaN if not measured, at a stamp [ns]."""
+        known = abs(velocity) <= _LARGEST[JOINT_STATES.name]
+        self._take(JOINT_STATES.name, stamp, (depth, velocity if known else 0.0, float(known)))
 
     def take_force(self, stamp: int, force: float) -> None:
         """Add the base force on the needle [N], positive into the tissue, at a stamp [ns]."""

@@ -65,7 +65,7 @@ def feed(
 ) -> None:
     for stamp, depth, velocity, force in samples:
         live.take_force(stamp, force)
-        live.take_motion(stamp + shift, depth, velocity if velocities else None)
+        live.take_motion(stamp + shift, depth, velocity if velocities else nan)
 
 
 def check(live: LiveRecording, tolerance: float) -> None:

@@ -3,6 +3,8 @@
 
 import math
 from pathlib import Path
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -252,6 +254,35 @@ def test_invalid_messages_are_counted_and_the_node_stays_active(ros_graph: RosGr
         discarded={'not finite': 1, 'clock set back': 1}
     )
     assert node.is_active
+
+
+#: Prints what the first live identification imports, in a new process.
+_FIRST = """
+import sys
+import numpy as np
+import rclpy
+from needle_identification.identification_node import IdentificationNode
+from rclpy.parameter import Parameter
+rclpy.init()
+node = IdentificationNode(parameter_overrides=[Parameter('live', value=True)])
+assert node.start(), node.failure
+for k in range(500):
+    velocity = 8e-3 * np.sin(8e-3 * k)
+    node._live.take_motion(4_000_000 * k, 0.1 - 4e-3 * np.cos(8e-3 * k), velocity)
+    node._live.take_force(4_000_000 * k, 0.5 * np.sign(velocity) + 300.0 * velocity)
+before = set(sys.modules)
+node._identify_live()
+assert node._found, node._doubts
+print(sorted(set(sys.modules) - before))
+"""
+
+
+def test_first_live_identification_imports_nothing() -> None:
+    """Libraries are imported before samples arrive."""
+    run = subprocess.run(
+        [sys.executable, '-c', _FIRST], capture_output=True, text=True, timeout=60.0, check=False
+    )
+    assert (run.stdout.splitlines()[-1:], run.returncode) == (['[]'], 0), run.stderr
 
 
 # Parameters of running nodes.
