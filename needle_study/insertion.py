@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 
 import needle_controller as control
 from needle_controller.controller import LAW_OF
-from needle_controller.in_loop.sampled import run_insertions
+from needle_controller.in_loop.sampled import motion_of, run_insertions
 from needle_controller.laws.law import Law, require_complete
 from needle_controller.safety.safety import Guard
 from needle_controller.stability import Uncertainty
@@ -63,9 +63,8 @@ class InsertionStudy(control.ReferenceLimits):
 
 
 class _Insertion(NamedTuple):
-    model: NeedleModel  #: the true needle
-    states: FloatArray  #: states at the samples, shape (k + 1, 2 (2 + n))
-    tip: FloatArray  #: tip deflection [m], shape (k + 1,)
+    #: Insertion depth [m], velocity [m/s] and tip deflection [m] at the samples, shape (3, k + 1).
+    motion: FloatArray
     commands: FloatArray  #: command of each sample [N], shape (k,)
     forces: FloatArray  #: force that acts from each sample on [N], shape (k,)
     noise: FloatArray  #: encoder errors of depth [m] and velocity [m/s], shape (k, 2)
@@ -74,24 +73,18 @@ class _Insertion(NamedTuple):
     left: float
 
     @property
-    def depth(self) -> FloatArray:
-        """Insertion depth [m], shape (k + 1,)."""
-        return np.asarray(self.model.parameters.length - self.states[:, 0])
-
-    @property
-    def velocity(self) -> FloatArray:
-        """Insertion velocity [m/s], shape (k + 1,)."""
-        return np.asarray(-self.states[:, self.model.coordinates])
-
-    @property
     def measured(self) -> FloatArray:
         """Measured depth [m] and velocity [m/s], shape (2, k + 1); the last is exact."""
-        noise = np.concatenate([self.noise, np.zeros((1, 2))])[: len(self.states)]
-        return np.asarray(np.stack([self.depth, self.velocity]) + noise.T)
+        found = self.motion[:2].copy()
+        count = min(len(self.noise), found.shape[1])
+        found[:, :count] += self.noise[:count].T
+        return found
 
     def until(self, end: int) -> '_Insertion':
-        cut = {name: getattr(self, name)[: end + 1] for name in ('states', 'tip', 'noise', 'goal')}
-        return self._replace(commands=self.commands[:end], forces=self.forces[:end], **cut)
+        return self._replace(
+            motion=self.motion[:, : end + 1], goal=self.goal[: end + 1],
+            noise=self.noise[: end + 1], commands=self.commands[:end], forces=self.forces[:end],
+        )  # fmt: skip
 
 
 class InsertionScenario(Scenario):
@@ -206,15 +199,14 @@ class InsertionScenario(Scenario):
         row = self.row(sample)
         (run,) = self._simulate([row], [rng])
         yield MeasuredRun(contract.TARGET, 0, (0.0, row['target'], 0.0))
-        m = run.model.coordinates
-        depths, velocities = run.measured
         # The effort acted up to the sample.
-        acted = np.concatenate([[0.0], run.forces])
-        for k, (state, tip) in enumerate(zip(run.states, run.tip, strict=True)):
+        joints = np.stack([*run.measured, np.concatenate([[0.0], run.forces])], axis=1)
+        for k, (depth, _, tip) in enumerate(run.motion.T.tolist()):
             stamp = round(k * self._period * NANOSECONDS)
-            joints = (depths[k], state[1], velocities[k], state[m + 1], acted[k], 0.0)
-            yield MeasuredRun(contract.JOINT_STATES, stamp, [float(value) for value in joints])
-            at = (0.0, float(run.depth[k]), float(tip))
+            position, velocity, effort = joints[k].tolist()
+            values = (position, 0.0, velocity, 0.0, effort, 0.0)
+            yield MeasuredRun(contract.JOINT_STATES, stamp, values)
+            at = (0.0, depth, tip)
             yield MeasuredRun(contract.TIP_DEFLECTION, stamp, at)
             if k < len(run.commands):
                 force = (0.0, float(run.commands[k]), 0.0)
@@ -267,11 +259,10 @@ class InsertionScenario(Scenario):
             limit=numbers.force_limit,
             step=numbers.step,
         )
-        for model, noise, late, one in zip(models, noises, lates, found, strict=True):
+        for noise, late, one in zip(noises, lates, found, strict=True):
             acting = np.concatenate([np.zeros(delay + late), one.commands])[: len(noise)]
             run = _Insertion(
-                model, one.states, model.tip_deflections(one.states), one.commands,
-                acting + noise[:, 2], noise[:, :2], one.goal, 0.0,
+                one.motion, one.commands, acting + noise[:, 2], noise[:, :2], one.goal, 0.0,
                 float(one.completed < len(noise)),
             ).until(one.completed)  # fmt: skip
             end = self._stop(run)
@@ -280,11 +271,12 @@ class InsertionScenario(Scenario):
     def _stop(self, run: _Insertion) -> int | None:
         """Return the sample of the stop by the guard, or None."""
         depth, velocity = run.measured
-        samples = np.stack([depth, velocity, run.goal - depth, run.tip], axis=1)
-        low, high = samples.min(axis=0), samples.max(axis=0)
+        samples = (depth, velocity, run.goal - depth, run.motion[2])
         # Limits are intervals: nearly always the extremes are within them, and so all samples.
-        extremes = np.stack([low, low, high, high])
-        return None if self._violated(extremes) is None else self._violated(samples)
+        extremes = [(one.min(), one.min(), one.max(), one.max()) for one in samples]
+        if self._violated(np.transpose(extremes)) is None:
+            return None
+        return self._violated(np.stack(samples, axis=1))
 
     def _violated(self, samples: FloatArray) -> int | None:
         """Return the first row of depth, velocity, error and deflection that the guard rejects."""
@@ -324,13 +316,12 @@ class InsertionScenario(Scenario):
             count = len(pushes)
             done = min(round(batch.completed[k] * numbers.rate), count)
             yield _Insertion(
-                model, batch.states[k], model.tip_deflections(batch.states[k]), pushes, forces[k],
-                blur[:, :2],
+                motion_of(model, batch.states[k]), pushes, forces[k], blur[:, :2],
                 np.full(count + 1, nan), nan, float(done < count),
             ).until(done)  # fmt: skip
 
     def _metrics_of(self, row: Row, run: _Insertion) -> dict[str, float]:
-        depth, velocity, target = run.depth, run.velocity, row['target']
+        (depth, velocity, tip), target = run.motion, row['target']
         error = abs(target - float(depth[-1]))
         beyond = copysign(1.0, target - row['depth']) * (depth - target)
         moving = np.flatnonzero(np.abs(velocity) > _REST)
@@ -344,7 +335,7 @@ class InsertionScenario(Scenario):
             'overshoot': max(0.0, float(beyond.max())),
             'following': float(np.sqrt(np.square(run.goal - depth).mean())),
             'force': float(np.abs(run.forces).max(initial=0.0)),
-            'deflection': float(np.abs(run.tip).max()),
+            'deflection': float(np.abs(tip).max()),
             'rest': still * self._period if whole and still < len(velocity) else nan,
             'reversals': float(np.count_nonzero(np.diff(directions))) if whole else nan,
             'stopped': run.stopped,

@@ -17,7 +17,7 @@ from math import inf, isnan, sqrt
 from typing import Annotated, Final, NamedTuple, TypeAlias
 
 from needle_dynamics.arrays import FloatArray, Vector
-from needle_dynamics.compiled.cache import compiled, kernel
+from needle_dynamics.compiled.cache import compiled, inlined, inlined_kernel, kernel
 from needle_dynamics.compiled.friction import (
     dry_friction,
     friction_flow,
@@ -25,7 +25,6 @@ from needle_dynamics.compiled.friction import (
     FrictionConstants,
     TANH,
 )
-import numpy as np
 
 #: Corrections of one direction, and the size of their estimate with its covariance.
 TERMS: Final = 3
@@ -53,13 +52,13 @@ MEMORY: Final = LEARNED + 2 * BLOCK
 _SLIDES: Final = 5e-4  #: Least speed at which friction is learned [m/s].
 
 
-@compiled
+@inlined
 def bounds(share: float, coulomb: float, viscous: float) -> tuple[float, float, float]:
     """Return the largest modulus of each correction [N], [N s/m], [N/m], relative to the model."""
     return share * coulomb, share * viscous, share * coulomb / LENGTH
 
 
-@compiled
+@inlined
 def correction(
     block: FloatArray, limits: tuple[float, float, float], depth: float, speed: float
 ) -> float:
@@ -69,7 +68,7 @@ def correction(
     return float(min(max(dry_part, -dry), dry) + min(max(block[1], -viscous), viscous) * speed)
 
 
-@compiled
+@inlined
 def learn(
     block: FloatArray,
     limits: tuple[float, float, float],
@@ -84,34 +83,40 @@ def learn(
 
     ``missing`` is the friction beyond the model [N], and ``noise`` its standard deviation.
     """
-    covariance = block[TERMS:].reshape((TERMS, TERMS))
-    prior = (0.5 * limits[0], 0.5 * limits[1], 0.5 * limits[2])
-    for i in range(TERMS):
-        if covariance[i, i] == 0.0:
-            covariance[i, i] = prior[i] * prior[i]
-        covariance[i, i] += prior[i] * prior[i] * period / _RELEARNED
-    for i in range(TERMS):
-        most = prior[i] * prior[i]
-        if covariance[i, i] > most:
-            shrink = sqrt(most / covariance[i, i])
-            for j in range(TERMS):
-                covariance[i, j] *= shrink
-            for j in range(TERMS):
-                covariance[j, i] *= shrink
-    regressors = (1.0, speed, depth - LENGTH)
-    weights = np.zeros(TERMS)
-    variance = noise * noise * max(_CORRELATED / period, 1.0)
-    error = missing
-    for i in range(TERMS):
-        for j in range(TERMS):
-            weights[i] += covariance[i, j] * regressors[j]
-        variance += regressors[i] * weights[i]
-        error -= regressors[i] * block[i]
-    for i in range(TERMS):
-        gain = weights[i] / variance
-        block[i] += gain * error
-        for j in range(TERMS):
-            covariance[i, j] -= gain * weights[j]
+    prior = (0.25 * limits[0] ** 2, 0.25 * limits[1] ** 2, 0.25 * limits[2] ** 2)
+    growth = period / _RELEARNED
+    # The covariance is symmetric: its diagonal, and the entries beside it.
+    c00 = (block[3] if block[3] > 0.0 else prior[0]) + growth * prior[0]
+    c11 = (block[7] if block[7] > 0.0 else prior[1]) + growth * prior[1]
+    c22 = (block[11] if block[11] > 0.0 else prior[2]) + growth * prior[2]
+    c01, c02, c12 = block[4], block[5], block[8]
+    if c00 > prior[0] or c11 > prior[1] or c22 > prior[2]:
+        s0 = _shrink(prior[0], c00)
+        s1 = _shrink(prior[1], c11)
+        s2 = _shrink(prior[2], c22)
+        c00, c11, c22 = s0 * s0 * c00, s1 * s1 * c11, s2 * s2 * c22
+        c01, c02, c12 = s0 * s1 * c01, s0 * s2 * c02, s1 * s2 * c12
+    # Regressors: 1, speed, and depth from `LENGTH`.
+    away = depth - LENGTH
+    w0 = c00 + c01 * speed + c02 * away
+    w1 = c01 + c11 * speed + c12 * away
+    w2 = c02 + c12 * speed + c22 * away
+    variance = noise * noise * max(_CORRELATED / period, 1.0) + w0 + speed * w1 + away * w2
+    error = missing - block[0] - speed * block[1] - away * block[2]
+    g0, g1, g2 = w0 / variance, w1 / variance, w2 / variance
+    block[0] += g0 * error
+    block[1] += g1 * error
+    block[2] += g2 * error
+    block[3], block[7], block[11] = c00 - g0 * w0, c11 - g1 * w1, c22 - g2 * w2
+    block[4] = block[6] = c01 - g0 * w1
+    block[5] = block[9] = c02 - g0 * w2
+    block[8] = block[10] = c12 - g1 * w2
+
+
+@inlined
+def _shrink(most: float, variance: float) -> float:
+    """Return the factor of a deviation that reduces its variance to the largest."""
+    return sqrt(most / variance) if variance > most else 1.0
 
 
 class LawConstants(NamedTuple):
@@ -191,7 +196,7 @@ class _Implicit(NamedTuple):
     reached: float
 
 
-@compiled
+@inlined
 def _friction(c: LawConstants) -> FrictionConstants:
     return FrictionConstants(
         int(c.friction_law),
@@ -204,7 +209,7 @@ def _friction(c: LawConstants) -> FrictionConstants:
     )
 
 
-@compiled
+@inlined
 def _dry(c: LawConstants, velocity: float, acceleration: float) -> float:
     """Return the dry friction of a motion [N] at its predicted velocity."""
     if c.coulomb == 0.0:
@@ -218,7 +223,7 @@ def _dry(c: LawConstants, velocity: float, acceleration: float) -> float:
     return level * min(max(soon / c.breakaway_speed, -1.0), 1.0)
 
 
-@compiled
+@inlined
 def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
     """Return the motion to follow: the reference, or the modeled motion, which converges to it."""
     if c.kind == PID:
@@ -234,7 +239,7 @@ def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
     return Instant(at.position, at.velocity, position, velocity, acceleration)
 
 
-@compiled
+@inlined
 def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
     """Return the learned additional friction of the motion to follow [N]."""
     if c.bound == 0.0:
@@ -246,7 +251,7 @@ def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
     return found * min(max(soon / c.breakaway_speed, -1.0), 1.0)
 
 
-@compiled
+@inlined
 def _learn(
     constants: LawTuple, memory: Vector, position: float, velocity: float, force: float
 ) -> None:
@@ -277,7 +282,7 @@ def _learn(
     )
 
 
-@compiled
+@inlined
 def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
     """Set up feed-forward and implicit feedback; see `needle_controller.laws.sampled.Pid`."""
     h = c.period
@@ -314,7 +319,7 @@ def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
     return _Implicit(forward, push, divisor, rate, slope, end, reached)
 
 
-@compiled
+@inlined
 def _step(c: LawConstants, memory: FloatArray, at: Instant, load: float, limit: float) -> float:
     """Return the force within its limit [N] and update the memory."""
     aim = _aim(c, memory, at)
@@ -369,7 +374,7 @@ def _match(
         memory[OFFSET] = missing
 
 
-@compiled
+@inlined
 def law_step(
     constants: LawTuple, memory: Vector, instant: InstantTuple, load: float, limit: float
 ) -> float:
@@ -377,7 +382,7 @@ def law_step(
     return _step(LawConstants(*constants), memory, Instant(*instant), load, limit)
 
 
-@compiled
+@inlined
 def axis_step(
     constants: LawTuple, position: float, velocity: float, force: float
 ) -> tuple[float, float]:
@@ -387,7 +392,7 @@ def axis_step(
     return position + moved, velocity
 
 
-@kernel
+@inlined_kernel
 def answer(
     constants: LawTuple,
     memory: Vector,

@@ -4,12 +4,21 @@
 from needle_controller.compiled.laws import (
     answer,
     axis_step,
+    InstantTuple,
     law_step,
     LawConstants,
     LawTuple,
     MEMORY,
 )
-from needle_dynamics.arrays import Array3, FloatArray, IntVector, Matrix, Vector
+from needle_dynamics.arrays import (
+    Array3,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    IntVector,
+    Matrix,
+    Vector,
+)
 from needle_dynamics.compiled.cache import inlined, kernel
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
 from needle_dynamics.compiled.lanes import (
@@ -21,8 +30,9 @@ from needle_dynamics.compiled.lanes import (
     LEFT,
     load_lane,
     ROWS,
-    save_lane,
     step_lanes,
+    TIP,
+    tip_lanes,
     VELOCITY,
 )
 from needle_dynamics.compiled.step import adapted, advance, CompiledNeedle, Inputs
@@ -48,19 +58,14 @@ def _respond(
     memory: FloatArray,
     pending: FloatArray,
     known: int,
-    setpoints: FloatArray,
-    goal: FloatArray,
-    at: int,
-    depth: float,
-    velocity: float,
+    instant: InstantTuple,
+    to_go: float,
     acts: float,
     limit: float,
 ) -> tuple[float, float, float, int]:
     """Return the command for a measurement, the force that acts, also for the law, and waits."""
-    aim, delay = setpoints[at], pending.shape[0]
-    instant = (depth, velocity, aim[0], aim[1], aim[2])
+    delay = pending.shape[0]
     command = answer(law, memory, pending[delay - known :], instant, acts, 0.0, limit, np.nan)
-    to_go = setpoints[len(setpoints) - 1, 0] - goal[at]
     waits = 1 if abs(command) >= limit and command * to_go > 0.0 else 0
     # Force of this period according to the law.
     acts = pending[delay - known] if known > 0 else command
@@ -122,8 +127,10 @@ def run_loop(
             break
         if noise.shape[0] > 0:
             depth, velocity = depth + noise[k, 0], velocity + noise[k, 1]
+        at = k - waited
+        instant = (depth, velocity, setpoints[at, 0], setpoints[at, 1], setpoints[at, 2])
         command, force, acts, waits = _respond(
-            law, memory, pending, known, setpoints, goal, k - waited, depth, velocity, acts, limit
+            law, memory, pending, known, instant, setpoints[count - 1, 0] - goal[at], acts, limit
         )
         waited += waits
         if commands.shape[0] > 0:
@@ -158,7 +165,8 @@ def run_lanes(
     noise: Array3,
     longest: float,
     which: IntVector,
-    states: Array3,
+    starts: Matrix,
+    motions: Array3,
     commands: Matrix,
     completed: Vector,
 ) -> None:
@@ -168,38 +176,59 @@ def run_lanes(
     Arrays are as for `run_loop` with a leading axis of runs, in falling order of the periods
     ``counts``, and long enough for all. ``which`` has the rows of the runs to compute, ``needles``
     and ``table`` are as for `lanes.run`. ``pending`` has shape (runs, longest delay), with the
-    ``delays``. ``states`` starts with the initial states. ``completed`` takes the periods.
+    ``delays``, and ``starts`` the initial states. ``motions``, shape (runs, 3, k + 1), takes
+    insertion depth, velocity and tip deflection at the measurements, ``completed`` the periods.
     """
     n, period = len(which), LawConstants(*law).period
     w, memory, acts = np.zeros(ROWS * LANES), np.zeros((n, MEMORY)), np.zeros(n)
     waited, inside = np.zeros(n, dtype=np.int64), np.ones(n, dtype=np.bool_)
     for i in range(n):
-        load_lane(w, i, needles[which[i]], states[which[i], 0], table)
+        load_lane(w, i, needles[which[i]], starts[which[i]], table)
+    _keep(w, n, table, which, inside, motions, 0)
     for k in range(counts[which[0]]):
         while counts[which[n - 1]] <= k:
             n -= 1
         for i in range(n):
-            run = which[i]
-            blur = noise[run, k]
-            commands[run, k], force, acts[i], waits = _respond(
-                law, memory[i], pending[run, : delays[run]], known, setpoints[run, : counts[run]],
-                goal[run], k - waited[i], w[DEPTH + i] + blur[0], w[VELOCITY + i] + blur[1],
-                acts[i], limit,
+            run, at = which[i], k - waited[i]
+            instant = (
+                w[DEPTH + i] + noise[run, k, 0], w[VELOCITY + i] + noise[run, k, 1],
+                setpoints[run, at, 0], setpoints[run, at, 1], setpoints[run, at, 2],
             )  # fmt: skip
+            to_go = setpoints[run, counts[run] - 1, 0] - goal[run, at]
+            commands[run, k], force, acts[i], waits = _respond(
+                law, memory[i], pending[run, : delays[run]], known, instant, to_go, acts[i], limit
+            )
             waited[i] += waits
-            w[FORCE + i] = force + blur[2]
+            w[FORCE + i] = force + noise[run, k, 2]
             w[LEFT + i], w[ACCELERATION + i] = period, 0.0
         # All lanes take steps of the same length.
         while w[LEFT] > 0.0:
             step_lanes(w, n, table, longest, 0.0)
             for i in range(n):
                 inside[i] &= w[INSIDE + i] != 0.0
+        _keep(w, n, table, which, inside, motions, k + 1)
         for i in range(n):
             if inside[i]:
-                before, state = states[which[i], k], states[which[i], k + 1]
-                state[1], state[5] = before[1] + period * before[5], before[5]
-                save_lane(w, i, table, state)
                 completed[which[i]] = k + 1
+
+
+@inlined
+def _keep(
+    w: FloatArray,
+    n: int,
+    table: FloatArray,
+    which: IntArray,
+    inside: BoolArray,
+    motions: FloatArray,
+    k: int,
+) -> None:
+    """Write the motion of each lane that is inside its range."""
+    tip_lanes(w, n, table)
+    for i in range(n):
+        if inside[i]:
+            run = which[i]
+            motions[run, 0, k], motions[run, 1, k] = w[DEPTH + i], w[VELOCITY + i]
+            motions[run, 2, k] = w[TIP + i]
 
 
 @kernel

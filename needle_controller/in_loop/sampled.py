@@ -281,7 +281,9 @@ def run_batch(
 class LoopInsertion(NamedTuple):
     """A run of `run_insertions`."""
 
-    states: FloatArray  #: states at the measurements, shape (k + 1, 2 (2 + n)); NaN as `LoopBatch`
+    #: Insertion depth [m], velocity [m/s] and tip deflection [m] at the measurements, shape
+    #: (3, k + 1); NaN after the needle has left its range.
+    motion: FloatArray
     commands: FloatArray  #: command for each measurement [N], shape (k,)
     goal: FloatArray  #: reference at the measurements [m], shape (k + 1,)
     completed: int  #: periods completed before the needle left its range
@@ -314,12 +316,12 @@ def run_insertions(
     chosen = [models[i] for i in order]
     setpoints, blurred = np.zeros((2, runs, most, 3))
     goal, commands = np.full((runs, most + 1), np.nan), np.full((runs, most), np.nan)
-    trajectories = np.full((runs, most + 1, len(states[0])), np.nan)
+    starts, motions = np.array([states[i] for i in order]), np.full((runs, 3, most + 1), np.nan)
     for k, i in enumerate(order.tolist()):
         count = counts[k]
         motion = _setpoints(references[i], law.period, count + delay + 1)
         setpoints[k, :count], goal[k, : count + 1] = motion[delay:-1], motion[: count + 1, 0]
-        blurred[k, :count], trajectories[k, 0] = noises[i], states[i]
+        blurred[k, :count] = noises[i]
     pending, completed = np.zeros((runs, int(delays.max()))), np.zeros(runs)
     parameters = [model.parameters for model in chosen]
     for reach, some in lane_groups(parameters, runs).items():
@@ -327,24 +329,32 @@ def run_insertions(
             for part in np.split(some, range(LANES, len(some), LANES)):
                 run_lanes(
                     lane_constants(parameters), lane_table(reach), law.packed, limit, setpoints,
-                    goal, counts, pending, delays, delay, blurred, step, part, trajectories,
+                    goal, counts, pending, delays, delay, blurred, step, part, starts, motions,
                     commands, completed,
                 )  # fmt: skip
             continue
         for k in some.tolist():
-            n, end = counts[k], trajectories[k, 0].copy()
+            n, model = counts[k], chosen[k]
+            trajectory = np.full((n + 1, starts.shape[1]), np.nan)
             completed[k] = run_loop(
-                chosen[k].compiled, end, law.packed, limit, setpoints[k, :n], goal[k, : n + 1],
+                model.compiled, starts[k], law.packed, limit, setpoints[k, :n], goal[k, : n + 1],
                 pending[k, : delays[k]], delay, blurred[k, :n], _NONE, step, np.empty(0),
-                trajectories[k, : n + 1], commands[k, :n], np.empty(3),
+                trajectory, commands[k, :n], np.empty(3),
             )  # fmt: skip
+            motions[k, :, : n + 1] = motion_of(model, trajectory)
     found = [
-        LoopInsertion(path[: n + 1], force[:n], aim[: n + 1], int(done))
-        for path, force, aim, n, done in zip(
-            trajectories, commands, goal, counts.tolist(), completed, strict=True
+        LoopInsertion(motion[:, : n + 1], force[:n], aim[: n + 1], int(done))
+        for motion, force, aim, n, done in zip(
+            motions, commands, goal, counts.tolist(), completed, strict=True
         )
     ]
     return [found[k] for k in np.argsort(order)]
+
+
+def motion_of(model: NeedleModel, states: FloatArray) -> FloatArray:
+    """Return insertion depth, velocity and tip deflection of states (k, 2 (2 + n)); (3, k)."""
+    depth, velocity = model.parameters.length - states[:, 0], -states[:, model.coordinates]
+    return np.stack([depth, velocity, model.tip_deflections(states)])
 
 
 def _setpoints(reference: Reference, period: float, count: int) -> FloatArray:

@@ -27,6 +27,7 @@ import numpy as np
 
 LANES: Final = 32  #: number of lanes per step: their rows fit into the first-level cache
 COLUMNS: Final = 26  #: columns of `ModeTables.series` for G, H, phi and phi'' of two modes
+_TIP: Final = (18, 22)  #: first and end of those for phi
 
 # Offset of each row of the lanes. First the constants.
 (
@@ -39,9 +40,11 @@ COLUMNS: Final = 26  #: columns of `ModeTables.series` for G, H, phi and phi'' o
     _H, _REST, _XI, _XI4, INSIDE, _IMPULSE,
     # Result of the step.
     _NEW_Q1, _NEW_Q2, _NEW_Z1, _NEW_Z2, _NEW_U, _TRAVEL, _STOPS,
+    # Tip deflection [m], by `tip_lanes`.
+    TIP,
     # Series of the modes.
     _SERIES,
-) = range(0, 36 * LANES, LANES)  # fmt: skip
+) = range(0, 37 * LANES, LANES)  # fmt: skip
 
 #: Number of rows that move with a needle between lanes.
 _KEPT: Final = _H // LANES
@@ -155,10 +158,10 @@ def _begin(w: FloatArray, n: int, longest: float, grade: float) -> None:
 
 
 @compiled
-def _modes(w: FloatArray, n: int, table: FloatArray) -> None:
-    """Evaluate the series of the modes: a first term, and four more at a time."""
+def _modes(w: FloatArray, n: int, table: FloatArray, first: int, end: int) -> None:
+    """Evaluate columns of the series of the modes: a first term, and four more at a time."""
     last = table.shape[0] - 1
-    for j in range(COLUMNS):
+    for j in range(first, end):
         row, top = _SERIES + j * LANES, table[last, j]
         for i in range(n):
             w[row + i] = top
@@ -262,10 +265,24 @@ def _end(w: FloatArray, n: int) -> None:
 def step_lanes(w: FloatArray, n: int, table: FloatArray, longest: float, grade: float) -> None:
     """Take one step of at most ``longest`` [s] in each of n lanes."""
     _begin(w, n, longest, grade)
-    _modes(w, n, table)
+    _modes(w, n, table, 0, COLUMNS)
     _rotate(w, n)
     _move(w, n)
     _end(w, n)
+
+
+@compiled
+def tip_lanes(w: FloatArray, n: int, table: FloatArray) -> None:
+    """Compute the tip deflection of each lane at its present depth."""
+    for i in range(n):
+        xi = w[DEPTH + i] / w[LENGTH + i]
+        square = xi * xi
+        w[_XI + i], w[_XI4 + i] = xi, square * square
+    _modes(w, n, table, *_TIP)
+    for i in range(n):
+        xi = w[_XI + i]
+        sum_of_modes = _line(w, 18, i, xi) * w[_Q1 + i] + _line(w, 20, i, xi) * w[_Q2 + i]
+        w[TIP + i] = xi * xi / sqrt(w[LENGTH + i]) * sum_of_modes
 
 
 @inlined

@@ -25,7 +25,7 @@ from needle_controller import (
     run_controller,
     Setpoint,
 )
-from needle_controller.in_loop.sampled import run_insertions
+from needle_controller.in_loop.sampled import motion_of, run_insertions
 from needle_controller.laws.law import SampledLoop
 from needle_dynamics import (
     FloatArray,
@@ -357,7 +357,7 @@ def test_insertions_together_equal_batches_of_one() -> None:
     for i, found in enumerate(together):
         one: Any = [[values[i]] for values in (models, starts, references, noises, lates)]
         alone = run_insertions(law, *one, **options)[0]
-        assert np.array_equal(found.states, alone.states)
+        assert np.array_equal(found.motion, alone.motion)
         assert np.array_equal(found.commands, alone.commands)
         batch = run_batch(
             law, models[i].parameters, starts[i], references[i], noise=noises[i], late=lates[i],
@@ -366,13 +366,14 @@ def test_insertions_together_equal_batches_of_one() -> None:
         assert found.completed == len(noises[i]) == len(found.commands)
         assert np.array_equal(found.goal, batch.goal)
         # Several needles with each instruction: rounding, which the closed loop amplifies.
-        reached = np.abs(batch.trajectories[0]).max(axis=0) + 1e-12
-        assert_allclose(found.states / reached, batch.trajectories[0] / reached, atol=1e-9)
+        motion = motion_of(models[i], batch.trajectories[0])
+        reached = np.abs(motion).max(axis=1, keepdims=True)
+        assert_allclose(found.motion / reached, motion / reached, atol=1e-9)
         assert_allclose(found.commands, batch.commands[0], atol=1e-7)
 
 
 def test_insertion_ends_where_its_needle_leaves_its_range() -> None:
-    """States are kept up to there, and the other needles continue."""
+    """The motion is kept up to there, and the other needles continue."""
     law = Pid(axis=Axis.insertion(NOMINAL), gains=PidGains(), period=PERIOD)
     model, out = NeedleModel(NOMINAL), MinimumJerk(Setpoint(2e-3), -0.01, ReferenceLimits())
     starts = [model.state_at(2e-3)] * 2
@@ -384,11 +385,12 @@ def test_insertion_ends_where_its_needle_leaves_its_range() -> None:
     batch = run_batch(law, NOMINAL, starts[0], out, duration=1.0, record=True, **options)
     ended = found[0].completed
     assert 0 < ended == batch.completed[0] < 1000
-    assert np.isfinite(found[0].states[ended]).all()
-    assert np.isnan(found[0].states[ended + 1 :]).all()
+    assert np.isfinite(found[0].motion[:, ended]).all()
+    assert np.isnan(found[0].motion[:, ended + 1 :]).all()
     assert found[1].completed == 1000
     alone = run_batch(law, NOMINAL, starts[1], rest, duration=1.0, record=True, **options)
-    assert_allclose(found[1].states[-1, 0], alone.states[0, 0], rtol=1e-9)
+    depth = NOMINAL.length - alone.states[0, 0]
+    assert_allclose(found[1].motion[0, -1], depth, rtol=1e-9)
 
 
 def test_batch_is_independent_of_threads_and_step() -> None:
