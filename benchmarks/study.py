@@ -2,7 +2,7 @@
 """
 Studies of populations: insertions per second, memory, and identical tables for all workers.
 
-The study is the example of `examples/studies`. Workers of each kind are started, and have loaded
+The studies are the examples of `examples/studies`. Workers of each kind are started, and have loaded
 or compiled their code, before a rate is measured; then they take turns.
 """
 
@@ -36,8 +36,10 @@ import numpy as np
 import psutil
 import yaml
 
-#: Study of the benchmark.
-STUDY: Final = Path(__file__).parents[1] / 'examples/studies/steering.yaml'
+#: Studies of the benchmark: steering, and insertion along the axis.
+STUDIES: Final = Path(__file__).parents[1] / 'examples/studies'
+STUDY: Final = STUDIES / 'steering.yaml'
+AXIS: Final = STUDIES / 'insertion.yaml'
 
 #: Changes for needles with a fixed guide: 100 mm in steps of 1 mm.
 _OPEN: Final = {'law': 'open_loop', 'depth': 0.1, 'step_length': 1e-3}
@@ -133,11 +135,16 @@ def _compare(folder: Path, plan: StudyPlan, tick: Tick) -> Answer:
     study = _study(plan.closed)
     tick('closed loop, in turns')
     least = take_turns(folder / 'timed', _study(plan.timed), plan.rounds)
-    tables = {}
+    tick('closed loop along the axis, in turns')
+    axis = _study(plan.timed, file=AXIS)
+    along = take_turns(folder / 'timed along', axis, plan.rounds)
+    tables, axial = {}, {}
     for name, (begin, workers) in WAYS.items():
         tick(f'closed loop, {plan.closed} insertions: {name}')
         with begin(engine.order(study), workers) as factory:
             tables[name] = computed(folder / name, study, factory, workers)
+        with begin(engine.order(axis), workers) as factory:
+            axial[name] = computed(folder / f'{name} along', axis, factory, workers)
     tick('Dask, a worker is killed')
     tables['a worker of Dask is killed half way'] = half_way(folder / 'half', study)
     watched = {}
@@ -149,12 +156,14 @@ def _compare(folder: Path, plan: StudyPlan, tick: Tick) -> Answer:
     tick('the study is killed')
     small = _study(max(plan.closed // 4, 1))
     kills, same = killed(folder / 'killed', small, plan.kills)
-    return _answer(plan, least, tables, watched, fed, kills, same)
+    sections, bars = _answer(plan, least, tables, watched, fed, kills, same)
+    section, own = _axial(plan, along, axial)
+    return [sections[0], section, *sections[1:]], [*bars, *own]
 
 
-def _study(samples: int, settings: dict[str, Any] | None = None) -> Study:
-    """Return the study with different numbers."""
-    document = read_study(STUDY).document
+def _study(samples: int, settings: dict[str, Any] | None = None, file: Path = STUDY) -> Study:
+    """Return a study with different numbers."""
+    document = read_study(file).document
     return build_study(
         {**document, 'samples': samples, 'settings': {**document['settings'], **(settings or {})}}
     )
@@ -327,6 +336,31 @@ def killed(folder: Path, study: Study, times: int) -> tuple[Kills, bool]:
 
 def _checksum(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _axial(
+    plan: StudyPlan, least: dict[str, float], tables: dict[str, str]
+) -> tuple[PageSection, list[Bar]]:
+    """Return the table and bars of insertions along the axis."""
+    rates = {name: plan.timed / taken for name, taken in least.items()}
+    one, two, _ = rates.values()
+    section = PageSection(
+        'Insertions along the axis under a control law',
+        ('who computes', 'per second', 'per second and worker', 'SHA-256 of the table'),
+        [
+            (name, number(rate), number(rate / WAYS[name][1]), f'`{tables[name][:16]}`')
+            for name, rate in rates.items()
+        ],
+        f'{plan.timed} insertions of `examples/studies/insertion.yaml`, from the first sample to '
+        f'the table, the best of {plan.rounds} turns. The time of a million follows from the '
+        'rate of two workers.',
+    )
+    bars = [
+        Bar('along the axis, per second and core', one, 500.0, at_least=True),
+        Bar('a million along the axis, two workers', _MILLION / two, 1200.0, 's'),
+        Bar('tables along the axis that differ', float(len({*tables.values()}) - 1), 0.0),
+    ]
+    return section, bars
 
 
 def _answer(

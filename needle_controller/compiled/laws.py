@@ -252,7 +252,7 @@ def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
 
 
 @inlined
-def _learn(
+def adapt(
     constants: LawTuple, memory: Vector, position: float, velocity: float, force: float
 ) -> None:
     """Learn friction from the last period and its force less known loads, if the axis slid."""
@@ -411,7 +411,7 @@ def answer(
     period [N]. Before its limit the force equals a ``taken_over`` one that is not nan [N].
     """
     position, velocity, target, rate, acceleration = instant
-    _learn(constants, memory, position, velocity, acted - load)
+    adapt(constants, memory, position, velocity, acted - load)
     for force in pending:
         position, velocity = axis_step(constants, position, velocity, force - load)
     at = (position, velocity, target, rate, acceleration)

@@ -2,9 +2,9 @@
 """Closed loop of a sampled law and the simulated needle, for batches of runs."""
 
 from needle_controller.compiled.laws import (
+    adapt,
     answer,
     axis_step,
-    InstantTuple,
     law_step,
     LawConstants,
     LawTuple,
@@ -53,23 +53,14 @@ def _delayed(pending: FloatArray, command: float) -> float:
 
 
 @inlined
-def _respond(
-    law: LawTuple,
-    memory: FloatArray,
-    pending: FloatArray,
-    known: int,
-    instant: InstantTuple,
-    to_go: float,
-    acts: float,
-    limit: float,
-) -> tuple[float, float, float, int]:
-    """Return the command for a measurement, the force that acts, also for the law, and waits."""
-    delay = pending.shape[0]
-    command = answer(law, memory, pending[delay - known :], instant, acts, 0.0, limit, np.nan)
-    waits = 1 if abs(command) >= limit and command * to_go > 0.0 else 0
-    # Force of this period according to the law.
-    acts = pending[delay - known] if known > 0 else command
-    return command, _delayed(pending, command), acts, waits
+def _waits(command: float, limit: float, to_go: float) -> int:
+    return 1 if abs(command) >= limit and command * to_go > 0.0 else 0
+
+
+@inlined
+def _past(commands: FloatArray, run: int, k: int) -> float:
+    """Return an earlier command of a run; zero before the first."""
+    return float(commands[run, k]) if k >= 0 else 0.0
 
 
 @kernel
@@ -129,10 +120,12 @@ def run_loop(
             depth, velocity = depth + noise[k, 0], velocity + noise[k, 1]
         at = k - waited
         instant = (depth, velocity, setpoints[at, 0], setpoints[at, 1], setpoints[at, 2])
-        command, force, acts, waits = _respond(
-            law, memory, pending, known, instant, setpoints[count - 1, 0] - goal[at], acts, limit
-        )
-        waited += waits
+        late = pending.shape[0] - known
+        command = answer(law, memory, pending[late:], instant, acts, 0.0, limit, np.nan)
+        waited += _waits(command, limit, setpoints[count - 1, 0] - goal[at])
+        # Force of this period according to the law.
+        acts = pending[late] if known > 0 else command
+        force = _delayed(pending, command)
         if commands.shape[0] > 0:
             commands[k] = command
         if noise.shape[0] > 0:
@@ -159,7 +152,6 @@ def run_lanes(
     setpoints: Array3,
     goal: Matrix,
     counts: IntVector,
-    pending: Matrix,
     delays: IntVector,
     known: int,
     noise: Array3,
@@ -175,9 +167,10 @@ def run_lanes(
 
     Arrays are as for `run_loop` with a leading axis of runs, in falling order of the periods
     ``counts``, and long enough for all. ``which`` has the rows of the runs to compute, ``needles``
-    and ``table`` are as for `lanes.run`. ``pending`` has shape (runs, longest delay), with the
-    ``delays``, and ``starts`` the initial states. ``motions``, shape (runs, 3, k + 1), takes
-    insertion depth, velocity and tip deflection at the measurements, ``completed`` the periods.
+    and ``table`` are as for `lanes.run`. ``delays`` are the periods until a command acts, before
+    which no force acts, and ``starts`` the initial states. ``motions``, shape (runs, 3, k + 1),
+    takes insertion depth, velocity and tip deflection at the measurements, ``completed`` the
+    periods.
     """
     n, period = len(which), LawConstants(*law).period
     w, memory, acts = np.zeros(ROWS * LANES), np.zeros((n, MEMORY)), np.zeros(n)
@@ -190,16 +183,17 @@ def run_lanes(
             n -= 1
         for i in range(n):
             run, at = which[i], k - waited[i]
-            instant = (
-                w[DEPTH + i] + noise[run, k, 0], w[VELOCITY + i] + noise[run, k, 1],
-                setpoints[run, at, 0], setpoints[run, at, 1], setpoints[run, at, 2],
-            )  # fmt: skip
-            to_go = setpoints[run, counts[run] - 1, 0] - goal[run, at]
-            commands[run, k], force, acts[i], waits = _respond(
-                law, memory[i], pending[run, : delays[run]], known, instant, to_go, acts[i], limit
-            )
-            waited[i] += waits
-            w[FORCE + i] = force + noise[run, k, 2]
+            # As `answer`: arrays of pending commands would take longer than the law.
+            depth, velocity = w[DEPTH + i] + noise[run, k, 0], w[VELOCITY + i] + noise[run, k, 1]
+            adapt(law, memory[i], depth, velocity, acts[i])
+            for late in range(known, 0, -1):
+                depth, velocity = axis_step(law, depth, velocity, _past(commands, run, k - late))
+            aim = setpoints[run, at, 0], setpoints[run, at, 1], setpoints[run, at, 2]
+            command = law_step(law, memory[i], (depth, velocity, *aim), 0.0, limit)
+            commands[run, k] = command
+            waited[i] += _waits(command, limit, setpoints[run, counts[run] - 1, 0] - goal[run, at])
+            acts[i] = _past(commands, run, k - known)
+            w[FORCE + i] = _past(commands, run, k - delays[run]) + noise[run, k, 2]
             w[LEFT + i], w[ACCELERATION + i] = period, 0.0
         # All lanes take steps of the same length.
         while w[LEFT] > 0.0:

@@ -322,14 +322,14 @@ def run_insertions(
         motion = _setpoints(references[i], law.period, count + delay + 1)
         setpoints[k, :count], goal[k, : count + 1] = motion[delay:-1], motion[: count + 1, 0]
         blurred[k, :count] = noises[i]
-    pending, completed = np.zeros((runs, int(delays.max()))), np.zeros(runs)
+    completed = np.zeros(runs)
     parameters = [model.parameters for model in chosen]
     for reach, some in lane_groups(parameters, runs).items():
         if reach is not None:
             for part in np.split(some, range(LANES, len(some), LANES)):
                 run_lanes(
                     lane_constants(parameters), lane_table(reach), law.packed, limit, setpoints,
-                    goal, counts, pending, delays, delay, blurred, step, part, starts, motions,
+                    goal, counts, delays, delay, blurred, step, part, starts, motions,
                     commands, completed,
                 )  # fmt: skip
             continue
@@ -338,7 +338,7 @@ def run_insertions(
             trajectory = np.full((n + 1, starts.shape[1]), np.nan)
             completed[k] = run_loop(
                 model.compiled, starts[k], law.packed, limit, setpoints[k, :n], goal[k, : n + 1],
-                pending[k, : delays[k]], delay, blurred[k, :n], _NONE, step, np.empty(0),
+                np.zeros(delays[k]), delay, blurred[k, :n], _NONE, step, np.empty(0),
                 trajectory, commands[k, :n], np.empty(3),
             )  # fmt: skip
             motions[k, :, : n + 1] = motion_of(model, trajectory)

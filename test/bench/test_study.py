@@ -23,17 +23,28 @@ SMALL = {
     'population': {'bending_length': {'uniform': [0.8, 1.2]}},
 }
 
+ALONG = {
+    'scenario': 'insertion',
+    'samples': 1,
+    'seed': 3,
+    'settings': {'wait': 0.1},
+    'population': {'target': {'uniform': [0.02, 0.03]}},
+}
+
 
 def test_report_has_all_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tables are equal, although workers and the study are killed."""
     file = tmp_path / 'study.yaml'
     file.write_text(yaml.safe_dump(SMALL))
+    along = tmp_path / 'along.yaml'
+    along.write_text(yaml.safe_dump(ALONG))
     monkeypatch.setattr(bench_study, 'STUDY', file)
+    monkeypatch.setattr(bench_study, 'AXIS', along)
     monkeypatch.setitem(bench_study.PLANS, 'quick', StudyPlan(400, 100, 1, (10, 20, 40), 2, 3))
     told: list[str] = []
-    [rates, memory, tables], bars = bench_study.compare(told.append, 'quick')
+    [rates, axial, memory, tables], bars = bench_study.compare(told.append, 'quick')
     assert [row[0] for row in rates.rows] == list(bench_study.WAYS)
-    for _, together, each in rates.rows:
+    for _, together, each, *_ in (*rates.rows, *axial.rows):
         assert float(together) >= float(each) > 0.0
     assert [row[0] for row in memory.rows] == ['10', '20', '40']
     # Memory of a process with NumPy and Numba.
@@ -43,6 +54,7 @@ def test_report_has_all_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert [row[0] for row in tables.rows] == [*bench_study.WAYS, killed]
     found = {bar.figure: bar for bar in bars}
     assert found['tables that differ'].found == 0.0
+    assert found['tables along the axis that differ'].found == 0.0
     assert found['insertions computed twice'].found == 0.0
     assert found['closed loop, per second and core'].limit == 200.0
     assert 'peak of parent, 40 over 20 insertions' in found
