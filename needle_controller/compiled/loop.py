@@ -31,6 +31,8 @@ from needle_dynamics.compiled.lanes import (
     load_lane,
     ROWS,
     step_lanes,
+    swap_lanes,
+    TIME,
     TIP,
     tip_lanes,
     VELOCITY,
@@ -147,6 +149,7 @@ def run_loop(
 def run_lanes(
     needles: Matrix,
     table: Matrix,
+    layers: Array3,
     law: LawTuple,
     limit: float,
     setpoints: Array3,
@@ -166,44 +169,61 @@ def run_lanes(
     Run a law with up to `LANES` needles as `run_loop`, several with each instruction.
 
     Arrays are as for `run_loop` with a leading axis of runs, in falling order of the periods
-    ``counts``, and long enough for all. ``which`` has the rows of the runs to compute, ``needles``
-    and ``table`` are as for `lanes.run`. ``delays`` are the periods until a command acts, before
-    which no force acts, and ``starts`` the initial states. ``motions``, shape (runs, 3, k + 1),
-    takes insertion depth, velocity and tip deflection at the measurements, ``completed`` the
-    periods.
+    ``counts``, and long enough for all. ``which`` has the rows of the runs to compute.
+    ``needles``, ``table`` and ``layers`` are as for `lanes.run`. ``delays`` are the periods until
+    a command acts, before which no force acts, and ``starts`` the initial states. ``motions``,
+    shape (runs, 3, k + 1), takes insertion depth, velocity and tip deflection at the
+    measurements, ``completed`` the periods.
     """
     n, period = len(which), LawConstants(*law).period
     w, memory, acts = np.zeros(ROWS * LANES), np.zeros((n, MEMORY)), np.zeros(n)
     waited, inside = np.zeros(n, dtype=np.int64), np.ones(n, dtype=np.bool_)
+    # Lanes change places; the run of each.
+    order = np.arange(n)
     for i in range(n):
-        load_lane(w, i, needles[which[i]], starts[which[i]], table)
-    _keep(w, n, table, which, inside, motions, 0)
+        load_lane(w, i, needles, which[i], starts[which[i]], table)
+    _keep(w, n, table, which, order, inside, motions, 0)
     for k in range(counts[which[0]]):
-        while counts[which[n - 1]] <= k:
-            n -= 1
+        for i in range(n - 1, -1, -1):
+            if counts[which[order[i]]] <= k:
+                n -= 1
+                _swap(w, order, i, n)
         for i in range(n):
-            run, at = which[i], k - waited[i]
+            own = order[i]
+            run, at = which[own], k - waited[own]
             # As `answer`: arrays of pending commands would take longer than the law.
             depth, velocity = w[DEPTH + i] + noise[run, k, 0], w[VELOCITY + i] + noise[run, k, 1]
-            adapt(law, memory[i], depth, velocity, acts[i])
+            adapt(law, memory[own], depth, velocity, acts[own])
             for late in range(known, 0, -1):
                 depth, velocity = axis_step(law, depth, velocity, _past(commands, run, k - late))
             aim = setpoints[run, at, 0], setpoints[run, at, 1], setpoints[run, at, 2]
-            command = law_step(law, memory[i], (depth, velocity, *aim), 0.0, limit)
+            command = law_step(law, memory[own], (depth, velocity, *aim), 0.0, limit)
             commands[run, k] = command
-            waited[i] += _waits(command, limit, setpoints[run, counts[run] - 1, 0] - goal[run, at])
-            acts[i] = _past(commands, run, k - known)
+            to_go = setpoints[run, counts[run] - 1, 0] - goal[run, at]
+            waited[own] += _waits(command, limit, to_go)
+            acts[own] = _past(commands, run, k - known)
             w[FORCE + i] = _past(commands, run, k - delays[run]) + noise[run, k, 2]
-            w[LEFT + i], w[ACCELERATION + i] = period, 0.0
-        # All lanes take steps of the same length.
-        while w[LEFT] > 0.0:
-            step_lanes(w, n, table, longest, 0.0)
-            for i in range(n):
-                inside[i] &= w[INSIDE + i] != 0.0
-        _keep(w, n, table, which, inside, motions, k + 1)
+            w[LEFT + i], w[ACCELERATION + i], w[TIME + i] = period, 0.0, k * period
+        # Lanes with a border between layers in this period take more steps.
+        m = n
+        while m > 0:
+            step_lanes(w, m, table, layers, longest, 0.0)
+            for i in range(m - 1, -1, -1):
+                inside[order[i]] &= w[INSIDE + i] != 0.0
+                if w[LEFT + i] == 0.0:
+                    m -= 1
+                    _swap(w, order, i, m)
+        _keep(w, n, table, which, order, inside, motions, k + 1)
         for i in range(n):
-            if inside[i]:
-                completed[which[i]] = k + 1
+            if inside[order[i]]:
+                completed[which[order[i]]] = k + 1
+
+
+@inlined
+def _swap(w: FloatArray, order: IntArray, i: int, j: int) -> None:
+    if i != j:
+        swap_lanes(w, i, j)
+        order[i], order[j] = order[j], order[i]
 
 
 @inlined
@@ -212,6 +232,7 @@ def _keep(
     n: int,
     table: FloatArray,
     which: IntArray,
+    order: IntArray,
     inside: BoolArray,
     motions: FloatArray,
     k: int,
@@ -219,8 +240,8 @@ def _keep(
     """Write the motion of each lane that is inside its range."""
     tip_lanes(w, n, table)
     for i in range(n):
-        if inside[i]:
-            run = which[i]
+        if inside[order[i]]:
+            run = which[order[i]]
             motions[run, 0, k], motions[run, 1, k] = w[DEPTH + i], w[VELOCITY + i]
             motions[run, 2, k] = w[TIP + i]
 

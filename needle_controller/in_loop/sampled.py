@@ -21,6 +21,7 @@ from needle_dynamics.display import Progress, progress_of
 from needle_dynamics.simulated.batch import (
     lane_constants,
     lane_groups,
+    lane_layers,
     lane_table,
     number_of_runs,
     thread_count,
@@ -324,12 +325,13 @@ def run_insertions(
         blurred[k, :count] = noises[i]
     completed = np.zeros(runs)
     parameters = [model.parameters for model in chosen]
+    layers = lane_layers(parameters)
     for reach, some in lane_groups(parameters, runs).items():
         if reach is not None:
             for part in np.split(some, range(LANES, len(some), LANES)):
                 run_lanes(
-                    lane_constants(parameters), lane_table(reach), law.packed, limit, setpoints,
-                    goal, counts, delays, delay, blurred, step, part, starts, motions,
+                    lane_constants(parameters), lane_table(reach), layers, law.packed, limit,
+                    setpoints, goal, counts, delays, delay, blurred, step, part, starts, motions,
                     commands, completed,
                 )  # fmt: skip
             continue

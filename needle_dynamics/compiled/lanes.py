@@ -2,10 +2,10 @@
 r"""
 Simulation of many needles in parallel, in the lanes of the processor's vector registers.
 
-The step equals `needle_dynamics.compiled.step` for two modes in homogeneous tissue under Coulomb
-friction. Loops over lanes have no calls and branches, so that the compiler can vectorize them;
-rare events (the motion stops, an interval ends) are handled lane by lane. Lanes are independent:
-results do not depend, to the bit, on the number and the order of the needles.
+The step equals `needle_dynamics.compiled.step` for two modes. Loops over lanes have no calls and
+branches, so that the compiler can vectorize them; rare events (the motion stops, an interval or a
+layer of tissue ends), swelling, and friction other than Coulomb's are handled lane by lane. Lanes
+are independent: results do not depend, to the bit, on the number and the order of the needles.
 
 Modes scale with the length of the needle: with the modes of a needle of length 1 (index 1),
 
@@ -20,9 +20,10 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import Array3, FloatArray, IntArray, IntVector, Matrix, Vector
 from needle_dynamics.compiled.cache import compiled, inlined, kernel
-from needle_dynamics.compiled.friction import slide
+from needle_dynamics.compiled.friction import COULOMB, friction_flow, FrictionConstants
 from needle_dynamics.compiled.modal_flow import normal_pair, turn_pair
 from needle_dynamics.compiled.step import GRADED_FROM
+from needle_dynamics.compiled.tissue import growth_at, time_to_layer
 import numpy as np
 
 LANES: Final = 32  #: number of lanes per step: their rows fit into the first-level cache
@@ -32,9 +33,12 @@ _TIP: Final = (18, 22)  #: first and end of those for phi
 # Offset of each row of the lanes. First the constants.
 (
     LENGTH, _DENSITY, _BENDING, _STIFFNESS, _DAMPING, _MASS, _COULOMB, _VISCOUS, _WITHDRAWAL,
-    _LOW, _HIGH, _STOP, _INERTIA,
-    # Motion, modes, and time left of the interval.
-    DEPTH, VELOCITY, ACCELERATION, _Q1, _Q2, _Z1, _Z2, FORCE, LEFT,
+    _LOW, _HIGH, _STOP, _INERTIA, _SWELLING, _SWELLING_TIME,
+    _LAW, _BREAKAWAY, _STRIBECK_SPEED, _SMOOTHING_SPEED,
+    # Motion, modes, time left of the interval, time, and row of the layers of the needle.
+    DEPTH, VELOCITY, ACCELERATION, _Q1, _Q2, _Z1, _Z2, FORCE, LEFT, TIME, _NEEDLE,
+    # Stiffness at the tip, and the addition of the layers above to the stiffness of the modes.
+    _TISSUE, _ABOVE11, _ABOVE12, _ABOVE22,
     # One step: its length, time left after it, relative depth in its middle and fourth power of
     # this depth, whether the depth is in range, and the impulse of the modes.
     _H, _REST, _XI, _XI4, INSIDE, _IMPULSE,
@@ -44,7 +48,7 @@ _TIP: Final = (18, 22)  #: first and end of those for phi
     TIP,
     # Series of the modes.
     _SERIES,
-) = range(0, 37 * LANES, LANES)  # fmt: skip
+) = range(0, 49 * LANES, LANES)  # fmt: skip
 
 #: Number of rows that move with a needle between lanes.
 _KEPT: Final = _H // LANES
@@ -82,6 +86,19 @@ class Constants(NamedTuple):
     highest: float
     stop: float  #: insertion depth at which the hub stops, or infinity [m]
     rotary_inertia: float
+    #: Final increase and time constant of the stiffness [1, s].
+    swelling: float
+    swelling_time: float
+    #: As in `FrictionConstants`.
+    law: float
+    breakaway_friction: float
+    stribeck_speed: float
+    smoothing_speed: float
+
+
+#: Columns of the layers of a needle: depth at which a layer begins [m], infinite without one; its
+#: stiffness [N/m^2]; and the addition to the stiffness of two modes (11, 12, 22) [N/m^2].
+LAYER: Final = 5
 
 
 class BatchTrajectory(NamedTuple):
@@ -136,25 +153,50 @@ def _decay_means(x: float) -> tuple[float, float]:
 
 
 @compiled
-def _begin(w: FloatArray, n: int, longest: float, grade: float) -> None:
-    """Compute the step of each lane and the depth in its middle."""
-    sixth = grade / 6.0
+def _begin(w: FloatArray, n: int, layers: FloatArray, longest: float, grade: float) -> None:
+    """Compute the step of each lane, the depth in its middle, and the tissue there."""
     for i in range(n):
-        s, u, left, length = w[DEPTH + i], w[VELOCITY + i], w[LEFT + i], w[LENGTH + i]
+        s, left, length = w[DEPTH + i], w[LEFT + i], w[LENGTH + i]
         whole = longest * max(1.0, grade * s / (GRADED_FROM * length))
         count = left / whole * (1.0 - 1e-9)
         near = (count + _ROUND) - _ROUND
         steps = max(near + 1.0 if near < count else near, 1.0)
         h = left / steps
+        w[_H + i] = h
+        w[_REST + i] = left - h if steps > 1.0 else 0.0
+    if layers.shape[1] > 1:
+        for i in range(n):
+            own = layers[int(w[_NEEDLE + i])]
+            border = time_to_layer(own[:, 0], own[:, 1], w[DEPTH + i], w[VELOCITY + i])
+            if 1e-3 * w[_H + i] < border < w[_H + i]:
+                # A step ends at a layer border, so that its stiffness is constant.
+                w[_H + i], w[_REST + i] = border, w[LEFT + i] - border
+    sixth = grade / 6.0
+    for i in range(n):
+        s, u, h, length = w[DEPTH + i], w[VELOCITY + i], w[_H + i], w[LENGTH + i]
         middle = min(s + 0.5 * h * u + sixth * h * h * w[ACCELERATION + i], w[_STOP + i])
         inside = w[_LOW + i] <= middle <= w[_HIGH + i]
         xi = middle / length if inside else 1.0
         square = xi * xi
-        w[_H + i] = h
-        w[_REST + i] = left - h if steps > 1.0 else 0.0
         w[_XI + i] = xi
         w[_XI4 + i] = square * square
         w[INSIDE + i] = 1.0 if inside else 0.0
+    if layers.shape[1] > 0:
+        for i in range(n):
+            _enter(w, i, layers[int(w[_NEEDLE + i])])
+
+
+@inlined
+def _enter(w: FloatArray, i: int, layers: FloatArray) -> None:
+    """Set the stiffness of the tissue in the middle of the step."""
+    k, middle = 0, w[_XI + i] * w[LENGTH + i]
+    while k + 1 < len(layers) and middle >= layers[k + 1, 0]:
+        k += 1
+    growth = growth_at(w[_SWELLING + i], w[_SWELLING_TIME + i], w[TIME + i] + 0.5 * w[_H + i])
+    w[_TISSUE + i] = growth * layers[k, 1]
+    w[_ABOVE11 + i] = growth * layers[k, 2]
+    w[_ABOVE12 + i] = growth * layers[k, 3]
+    w[_ABOVE22 + i] = growth * layers[k, 4]
 
 
 @compiled
@@ -189,15 +231,15 @@ def _rotate(w: FloatArray, n: int) -> None:
     """Advance the deflections through the step, as `modal_flow.rotate_two`."""
     for i in range(n):
         h, xi, rho = w[_H + i], w[_XI + i], w[_DENSITY + i]
-        ka, length = w[_STIFFNESS + i], w[LENGTH + i]
+        ka, length = w[_TISSUE + i], w[LENGTH + i]
         ei = w[_BENDING + i] / (length * length * length * length)
         fifth = w[_XI4 + i] * xi
         g11 = fifth * _powers(w, 0, i, xi)
         g12 = fifth * _powers(w, 3, i, xi)
         g22 = fifth * _powers(w, 6, i, xi)
-        k11 = ei * (xi * _powers(w, 9, i, xi)) + ka * g11
-        k12 = ei * (xi * _powers(w, 12, i, xi)) + ka * g12
-        k22 = ei * (xi * _powers(w, 15, i, xi)) + ka * g22
+        k11 = ei * (xi * _powers(w, 9, i, xi)) + ka * g11 + w[_ABOVE11 + i]
+        k12 = ei * (xi * _powers(w, 12, i, xi)) + ka * g12 + w[_ABOVE12 + i]
+        k22 = ei * (xi * _powers(w, 15, i, xi)) + ka * g22 + w[_ABOVE22 + i]
         m = normal_pair(rho, g11, g12, g22, k11, k12, k22)
         v1 = w[_Z1 + i] * m.i11
         v2 = (w[_Z2 + i] - m.l21 * v1) * m.i22
@@ -220,7 +262,7 @@ def _rotate(w: FloatArray, n: int) -> None:
 
 @compiled
 def _move(w: FloatArray, n: int) -> None:
-    """Move the insertion axis, as `friction.slide` where the motion does not stop."""
+    """Move the insertion axis, as `friction.friction_flow`."""
     for i in range(n):
         h, u, mass = w[_H + i], w[VELOCITY + i], w[_MASS + i]
         sign, factor = (1.0, 1.0) if u > 0.0 else (-1.0, w[_WITHDRAWAL + i])
@@ -233,12 +275,16 @@ def _move(w: FloatArray, n: int) -> None:
         w[_TRAVEL + i] = h * (u * mean + a * h * ramp)
         w[_STOPS + i] = 1.0 if new_u * u <= 0.0 else 0.0
     for i in range(n):
-        if w[_STOPS + i] != 0.0:
+        if w[_STOPS + i] != 0.0 or w[_LAW + i] != COULOMB:
             h = w[_H + i]
-            w[_NEW_U + i], w[_TRAVEL + i] = slide(
-                w[VELOCITY + i], w[FORCE + i] - w[_IMPULSE + i] / h, w[_MASS + i], w[_COULOMB + i],
-                w[_VISCOUS + i], h, w[_WITHDRAWAL + i],
+            friction = FrictionConstants(
+                int(w[_LAW + i]), w[_COULOMB + i], w[_VISCOUS + i], w[_WITHDRAWAL + i],
+                w[_BREAKAWAY + i], w[_STRIBECK_SPEED + i], w[_SMOOTHING_SPEED + i],
             )  # fmt: skip
+            drive = w[FORCE + i] - w[_IMPULSE + i] / h
+            w[_NEW_U + i], w[_TRAVEL + i] = friction_flow(
+                friction, w[_MASS + i], w[VELOCITY + i], drive, h
+            )
 
 
 @compiled
@@ -258,13 +304,15 @@ def _end(w: FloatArray, n: int) -> None:
         w[_Q2 + i] = w[_NEW_Q2 + i] if inside else w[_Q2 + i]
         w[_Z1 + i] = w[_NEW_Z1 + i] if inside else w[_Z1 + i]
         w[_Z2 + i] = w[_NEW_Z2 + i] if inside else w[_Z2 + i]
-        w[LEFT + i] = w[_REST + i]
+        w[LEFT + i], w[TIME + i] = w[_REST + i], w[TIME + i] + w[_H + i]
 
 
 @inlined
-def step_lanes(w: FloatArray, n: int, table: FloatArray, longest: float, grade: float) -> None:
+def step_lanes(
+    w: FloatArray, n: int, table: FloatArray, layers: FloatArray, longest: float, grade: float
+) -> None:
     """Take one step of at most ``longest`` [s] in each of n lanes."""
-    _begin(w, n, longest, grade)
+    _begin(w, n, layers, longest, grade)
     _modes(w, n, table, 0, COLUMNS)
     _rotate(w, n)
     _move(w, n)
@@ -300,8 +348,9 @@ def _gram(table: FloatArray, xi: float) -> tuple[float, float, float]:
 
 @compiled
 def load_lane(
-    w: FloatArray, i: int, constants: FloatArray, state: FloatArray, table: FloatArray
+    w: FloatArray, i: int, needles: FloatArray, which: int, state: FloatArray, table: FloatArray
 ) -> None:
+    constants = needles[which]
     for k in range(len(constants)):
         w[k * LANES + i] = constants[k]
     length, rho = constants[0], constants[1]
@@ -311,6 +360,14 @@ def load_lane(
     w[_Q1 + i], w[_Q2 + i] = state[2], state[3]
     w[_Z1 + i] = rho * (g11 * state[6] + g12 * state[7])
     w[_Z2 + i] = rho * (g12 * state[6] + g22 * state[7])
+    w[TIME + i], w[_NEEDLE + i], w[_TISSUE + i] = 0.0, float(which), w[_STIFFNESS + i]
+    w[_ABOVE11 + i] = w[_ABOVE12 + i] = w[_ABOVE22 + i] = 0.0
+
+
+@compiled
+def swap_lanes(w: FloatArray, i: int, j: int) -> None:
+    for row in range(0, _KEPT * LANES, LANES):
+        w[row + i], w[row + j] = w[row + j], w[row + i]
 
 
 @compiled
@@ -333,6 +390,7 @@ def save_lane(w: FloatArray, i: int, table: FloatArray, state: FloatArray) -> No
 def run(
     needles: Matrix,
     table: Matrix,
+    layers: Array3,
     trajectory: BatchTrajectory,
     runs: IntVector,
     states: Matrix,
@@ -340,8 +398,10 @@ def run(
     completed: Vector,
 ) -> None:
     """Advance needles through intervals of constant inputs."""
-    # ``needles``, shape (all or 1, 13), are `Constants`; ``table``, shape (1 + 4 m, 26), the first
-    # columns of the series of two modes of length 1; ``runs`` the indices of the runs to compute.
+    # ``needles``, shape (all or 1, 19), are `Constants`; ``table``, shape (1 + 4 m, 26), the first
+    # columns of the series of two modes of length 1; ``layers``, shape (all or 1, m, `LAYER`), the
+    # layers of the tissue, with m = 0 if all needles are in one that does not swell; ``runs`` the
+    # indices of the runs to compute.
     # Outputs: ``states``, shape (all, 8), at the end; ``kept``, shape (all, count + 1, 8), at the
     # ends of the intervals (unused if it has one row per run); ``completed``, shape (all,),
     # intervals.
@@ -353,7 +413,7 @@ def run(
         while n < LANES and waiting < len(runs):
             i = runs[waiting]
             waiting += 1
-            load_lane(w, n, needles[i if len(needles) > 1 else 0], states[i], table)
+            load_lane(w, n, needles, i if len(needles) > 1 else 0, states[i], table)
             if kept.shape[1] > 1:
                 kept[i, 0] = states[i]
             which[n], at[n] = i, 0
@@ -362,7 +422,7 @@ def run(
             n += 1
         if n == 0:
             return
-        step_lanes(w, n, table, trajectory.longest, 1.0 if trajectory.graded else 0.0)
+        step_lanes(w, n, table, layers, trajectory.longest, 1.0 if trajectory.graded else 0.0)
         # Backwards: a lane that ends is filled with the last lane, which is already checked.
         for i in range(n - 1, -1, -1):
             continues = w[INSIDE + i] != 0.0

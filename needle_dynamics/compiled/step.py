@@ -263,7 +263,7 @@ def _steps(  # noqa: C901
         count -= 1
         rest = left - h if count > 0 else 0.0
         if layered:
-            border = time_to_layer(layers, s, u)
+            border = time_to_layer(layers.starts, layers.stiffnesses, s, u)
             if 1e-3 * h < border < h:
                 # A step ends at a layer border, so that its stiffness is constant.
                 h, rest, renew = border, left - border, True

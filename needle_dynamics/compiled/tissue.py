@@ -33,9 +33,10 @@ def layer_at(starts: FloatArray, depth: float, layer: int = 0) -> int:
 
 
 @compiled
-def time_to_layer(layers: Layers, depth: float, velocity: float) -> float:
+def time_to_layer(
+    starts: FloatArray, stiffnesses: FloatArray, depth: float, velocity: float
+) -> float:
     """Return the time to the next border between unlike layers [s], inf without border ahead."""
-    starts, stiffnesses = layers.starts, layers.stiffnesses
     soonest = inf
     for i in range(1, starts.shape[0]):
         ahead = (starts[i] - depth) / velocity if velocity != 0.0 else inf

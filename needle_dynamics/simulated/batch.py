@@ -14,6 +14,7 @@ from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled import lanes
 from needle_dynamics.compiled.intervals import run
 from needle_dynamics.display import Progress, progress_of
+from needle_dynamics.friction import LAW_NUMBERS
 from needle_dynamics.model import NeedleModel, ROUNDING
 from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
@@ -232,13 +233,14 @@ def _take(
             progress()
 
     def together(needles: FloatArray, table: FloatArray, some: IntArray) -> None:
-        lanes.run(needles, table, inputs, some, states, kept, completed)
+        lanes.run(needles, table, layers, inputs, some, states, kept, completed)
         for _ in some:
             progress()
 
     # Several runs per task: the overhead of one task per run exceeds the cost of short runs.
     size = min(_CHUNK, -(-runs // workers))
     jobs = list[Callable[[], None]]()
+    layers = lane_layers(each)
     groups = lane_groups(each, runs) if tolerance is None else {None: np.arange(runs)}
     for reach, some in groups.items():
         job = alone
@@ -279,17 +281,11 @@ def lane_groups(each: Sequence[NeedleParameters], runs: int) -> dict[float | Non
 
 
 def _fits(p: NeedleParameters) -> bool:
-    return (
-        p.modes == 2
-        and p.formulation == 'complete'
-        and p.friction_law == 'coulomb'
-        and p.swelling == 0.0
-        and not p.layer_depths
-    )
+    return p.modes == 2 and p.formulation == 'complete'
 
 
 def lane_constants(each: Sequence[NeedleParameters]) -> FloatArray:
-    """Return the rows of `lanes.Constants`, shape (runs, 13)."""
+    """Return the rows of `lanes.Constants`, shape (runs, 19)."""
     values = np.array([_READ(p) for p in each], dtype=np.float64).T
     columns = dict(zip(_OWN, values[3:], strict=True))
     least, reach, stops = values[:3]
@@ -297,7 +293,24 @@ def lane_constants(each: Sequence[NeedleParameters]) -> FloatArray:
     columns['lowest'] = least - ROUNDING * length
     columns['highest'] = reach * length
     columns['stop'] = np.where(stops, length, inf)
+    columns['law'] = np.array([LAW_NUMBERS[p.friction_law] for p in each], dtype=np.float64)
     return np.column_stack([columns[name] for name in lanes.Constants._fields])
+
+
+def lane_layers(each: Sequence[NeedleParameters]) -> FloatArray:
+    """Return the layers of `lanes.run`, shape (runs, m, `lanes.LAYER`)."""
+    varied = [k for k, p in enumerate(each) if _fits(p) and (p.swelling or p.layer_depths)]
+    most = max((1 + len(each[k].layer_depths) for k in varied), default=0)
+    found = np.zeros((len(each), most, lanes.LAYER))
+    if most:
+        found[:, 1:, 0] = inf
+        found[:, 0, 1] = [p.tissue_stiffness for p in each]
+    for k in varied:
+        layers = NeedleModel(each[k]).compiled.layers
+        gram = layers.gram[:, [0, 0, 1], [0, 1, 1]]
+        rows = np.column_stack([layers.starts, layers.stiffnesses, gram])
+        found[k, : len(rows)] = rows
+    return found
 
 
 @cache

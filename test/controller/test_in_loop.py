@@ -341,7 +341,8 @@ def test_insertions_together_equal_batches_of_one() -> None:
     law = InverseDynamics(
         axis=Axis.insertion(NOMINAL), gains=InverseDynamicsGains(), period=PERIOD
     )
-    changes: list[dict[str, Any]] = [{}, {'friction_law': 'stribeck'}, {'tissue_stiffness': 2e3}]
+    layers = {'layer_depths': (0.021,), 'layer_stiffnesses': (4e3,), 'swelling': 0.2}
+    changes: list[dict[str, Any]] = [layers, {'friction_law': 'stribeck'}, {}]
     models = [NeedleModel(replace(NOMINAL, **one)) for one in changes]
     starts = [model.state_at(0.02, 2e-4) for model in models]
     targets = [Setpoint(0.02), Setpoint(0.02), Setpoint(0.0201)]

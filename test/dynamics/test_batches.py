@@ -76,8 +76,20 @@ def test_bits_do_not_depend_on_the_number_of_workers(n: int) -> None:
         assert np.array_equal(other.completed, first.completed)
 
 
+def assert_equal(found: FloatArray, exact: FloatArray, p: NeedleParameters) -> None:
+    """Compare states: to the bit, except for needles that are computed together."""
+    if p.modes != 2 or p.formulation == 'as_printed':
+        assert np.array_equal(found, exact)
+        return
+    # Rounding. With `tanh` it can change where a step is divided, by the error of such a part.
+    tolerance = 1e-4 if p.friction_law == 'tanh' else 1e-10
+    scale = np.abs(exact).max(axis=0) + 1e-12
+    assert_allclose(found / scale, exact / scale, rtol=0.0, atol=tolerance)
+
+
 @pytest.mark.parametrize('n', [1, 2, 4])
-def test_batch_equals_single_simulations_bit_for_bit(n: int) -> None:
+def test_batch_equals_single_simulations(n: int) -> None:
+    """With all friction laws, in two layers that swell."""
     constants, states, forces = study(n)
     found = batch(constants, states, forces)
     for i in range(RUNS):
@@ -94,7 +106,7 @@ def test_batch_equals_single_simulations_bit_for_bit(n: int) -> None:
             interval=INTERVAL,
             step=DEFAULT_STEP,
         )
-        assert np.array_equal(found.states[i], alone.states)
+        assert_equal(found.states[i], alone.states, constants[i])
         assert np.array_equal(found.time, alone.time)
         assert_allclose(found.completed[i], COUNT * INTERVAL, rtol=1e-15)
 
@@ -151,10 +163,16 @@ def test_batch_equals_the_integrator_over_its_intervals() -> None:
     found = batch(constants, states, forces)
     for i in range(RUNS):
         it = Integrator(constants[i], states[i])
+        reached = [it.state.copy()]
         for k in range(COUNT):
             it.advance(INTERVAL, forces[i, k])
-        # The sum of intervals differs from a multiple in the last bit, which affects the swelling.
-        assert_allclose(it.state, found.states[i, -1], rtol=1e-9, atol=1e-15)
+            reached.append(it.state.copy())
+        exact, p = np.array(reached), constants[i]
+        if p.formulation == 'complete':
+            assert_equal(found.states[i], exact, p)
+        else:
+            # The sum of intervals differs from a multiple in the last bit: so does the swelling.
+            assert_allclose(found.states[i], exact, rtol=1e-9, atol=1e-15)
 
 
 def test_single_values_apply_to_all_runs() -> None:

@@ -33,6 +33,10 @@ def population(runs: int, seed: int = 3) -> tuple[list[NeedleParameters], FloatA
             withdrawal_friction=rng.uniform(0.5, 1.5),
             carriage_mass=rng.choice([0.0, 0.1]),
             hub_stop=bool(i % 3),
+            layer_depths=(0.05, 0.09) if i % 4 == 0 else (),
+            layer_stiffnesses=(4e3, 500.0) if i % 4 == 0 else (),
+            swelling=0.5 * (i % 5 == 0),
+            swelling_time=0.01,
         )
         for i in range(runs)
     ]
@@ -53,7 +57,7 @@ def batch(*arguments: Any, **options: Any) -> Batch:
 
 @pytest.mark.parametrize('graded', [False, True])
 def test_lane_equals_a_single_simulation(graded: bool) -> None:
-    """Pushed, held and pulled, with and without hub and damping."""
+    """Pushed, held and pulled, with and without hub, damping, layers and swelling."""
     needles, states, forces = population(60)
     found = batch(needles, states, forces, graded=graded)
     stuck = moved = 0
