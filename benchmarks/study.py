@@ -2,8 +2,8 @@
 """
 Studies of populations: insertions per second, memory, and identical tables for all workers.
 
-The studies are examples of `examples/studies`. Workers of each kind are started, and have loaded or
-compiled their code, before a rate is measured; then they take turns.
+The studies are examples of `examples/studies`. Workers of each kind are started, and have loaded
+or compiled their code, before a rate is measured; then they take turns.
 """
 
 from __future__ import annotations
