@@ -22,6 +22,7 @@ from needle_dynamics.simulated.batch import (
     lane_constants,
     lane_groups,
     lane_layers,
+    lane_states,
     lane_table,
     number_of_runs,
     thread_count,
@@ -318,6 +319,7 @@ def run_insertions(
     setpoints, blurred = np.zeros((2, runs, most, 3))
     goal, commands = np.full((runs, most + 1), np.nan), np.full((runs, most), np.nan)
     starts, motions = np.array([states[i] for i in order]), np.full((runs, 3, most + 1), np.nan)
+    wide = lane_states(starts)
     for k, i in enumerate(order.tolist()):
         count = counts[k]
         motion = _setpoints(references[i], law.period, count + delay + 1)
@@ -325,14 +327,14 @@ def run_insertions(
         blurred[k, :count] = noises[i]
     completed = np.zeros(runs)
     parameters = [model.parameters for model in chosen]
-    layers = lane_layers(parameters)
+    layers, modes = lane_layers(parameters), parameters[0].modes
     for reach, some in lane_groups(parameters, runs).items():
         if reach is not None:
             for part in np.split(some, range(LANES, len(some), LANES)):
                 run_lanes(
-                    lane_constants(parameters), lane_table(reach), layers, law.packed, limit,
-                    setpoints, goal, counts, delays, delay, blurred, step, part, starts, motions,
-                    commands, completed,
+                    lane_constants(parameters), lane_table(reach, modes), layers, law.packed,
+                    limit, setpoints, goal, counts, delays, delay, blurred, step, part, wide,
+                    motions, commands, completed,
                 )  # fmt: skip
             continue
         for k in some.tolist():

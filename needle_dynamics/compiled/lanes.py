@@ -2,10 +2,11 @@
 r"""
 Simulation of many needles in parallel, in the lanes of the processor's vector registers.
 
-The step equals `needle_dynamics.compiled.step` for two modes. Loops over lanes have no calls and
-branches, so that the compiler can vectorize them; rare events (the motion stops, an interval or a
-layer of tissue ends), swelling, and friction other than Coulomb's are handled lane by lane. Lanes
-are independent: results do not depend, to the bit, on the number and the order of the needles.
+The step equals `needle_dynamics.compiled.step` for up to two modes. Loops over lanes have no calls
+and branches, so that the compiler can vectorize them; rare events (the motion stops, an interval
+or a layer of tissue ends), swelling, and friction other than Coulomb's are handled lane by lane.
+Lanes are independent: results do not depend, to the bit, on the number and the order of the
+needles.
 
 Modes scale with the length of the needle: with the modes of a needle of length 1 (index 1),
 
@@ -29,6 +30,9 @@ import numpy as np
 LANES: Final = 32  #: number of lanes per step: their rows fit into the first-level cache
 COLUMNS: Final = 26  #: columns of `ModeTables.series` for G, H, phi and phi'' of two modes
 _TIP: Final = (18, 22)  #: first and end of those for phi
+#: Those that couple the second mode with the first one, and with the tip.
+SECOND: Final = [3, 4, 5, 12, 13, 14, 20, 21, 24, 25]
+STATE: Final = 8  #: entries of the state of two modes
 
 # Offset of each row of the lanes. First the constants.
 (

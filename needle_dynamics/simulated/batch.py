@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parallel simulation of many insertions on all cores."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
@@ -28,6 +28,7 @@ _CHUNK: Final = 256  #: largest number of runs per task, enough to fill all vect
 
 #: Constants of the lanes that are attributes of `NeedleParameters`; read after the first three.
 _OWN: Final = [one for one in lanes.Constants._fields if hasattr(NeedleParameters, one)]
+_ONE_MODE: Final = [0, 1, 2, 4, 5, 6]  #: entries of a state in the lanes for a single mode
 _READ: Final = attrgetter('minimum_depth', 'reach', 'hub_stop', *_OWN)
 
 
@@ -233,7 +234,7 @@ def _take(
             progress()
 
     def together(needles: FloatArray, table: FloatArray, some: IntArray) -> None:
-        lanes.run(needles, table, layers, inputs, some, states, kept, completed)
+        lanes.run(needles, table, layers, inputs, some, wide, wide_kept, completed)
         for _ in some:
             progress()
 
@@ -241,19 +242,31 @@ def _take(
     size = min(_CHUNK, -(-runs // workers))
     jobs = list[Callable[[], None]]()
     layers = lane_layers(each)
-    groups = lane_groups(each, runs) if tolerance is None else {None: np.arange(runs)}
+    groups = lane_groups(each, runs, together=tolerance is None)
+    wide, wide_kept = lane_states(states), lane_states(kept)
     for reach, some in groups.items():
         job = alone
         if reach is not None:
-            job = partial(together, lane_constants(each), lane_table(reach))
+            job = partial(together, lane_constants(each), lane_table(reach, each[0].modes))
         jobs += [partial(job, some[k : k + size]) for k in range(0, len(some), size)]
     with ThreadPoolExecutor(workers) as pool:
         for done in [pool.submit(job) for job in jobs]:
             done.result()
+    _take_one_mode(groups, states, wide)
+    _take_one_mode(groups, kept, wide_kept)
     if not keep:
         whole = completed == inputs.intervals
         kept[whole, 0] = states[whole]
     return kept, completed, errors
+
+
+def _take_one_mode(
+    groups: Mapping[float | None, IntArray], states: FloatArray, wide: FloatArray
+) -> None:
+    """Copy the states of needles with one mode from those of the lanes, if these are others."""
+    for reach, some in groups.items():
+        if reach is not None and wide is not states:
+            states[some] = wide[some][..., _ONE_MODE]
 
 
 def _check(each: Sequence[NeedleParameters], starts: FloatArray) -> None:
@@ -269,9 +282,11 @@ def _check(each: Sequence[NeedleParameters], starts: FloatArray) -> None:
         NeedleModel(each[i % len(each)]).checked_state(starts[i % len(starts)])
 
 
-def lane_groups(each: Sequence[NeedleParameters], runs: int) -> dict[float | None, IntArray]:
+def lane_groups(
+    each: Sequence[NeedleParameters], runs: int, *, together: bool = True
+) -> dict[float | None, IntArray]:
     """Group the runs by the reach of a shared mode table; None for runs without one."""
-    reaches = [p.reach if _fits(p) else None for p in each]
+    reaches = [p.reach if together and _fits(p) else None for p in each]
     if len(each) == 1:
         return {reaches[0]: np.arange(runs)}
     return {
@@ -281,7 +296,7 @@ def lane_groups(each: Sequence[NeedleParameters], runs: int) -> dict[float | Non
 
 
 def _fits(p: NeedleParameters) -> bool:
-    return p.modes == 2 and p.formulation == 'complete'
+    return p.modes <= 2 and p.formulation == 'complete'
 
 
 def lane_constants(each: Sequence[NeedleParameters]) -> FloatArray:
@@ -307,15 +322,28 @@ def lane_layers(each: Sequence[NeedleParameters]) -> FloatArray:
         found[:, 0, 1] = [p.tissue_stiffness for p in each]
     for k in varied:
         layers = NeedleModel(each[k]).compiled.layers
-        gram = layers.gram[:, [0, 0, 1], [0, 1, 1]]
+        gram = layers.gram[(slice(None), *np.triu_indices(each[k].modes))]
         rows = np.column_stack([layers.starts, layers.stiffnesses, gram])
-        found[k, : len(rows)] = rows
+        found[k, : len(rows), : rows.shape[1]] = rows
     return found
 
 
 @cache
-def lane_table(reach: float) -> FloatArray:
+def lane_table(reach: float, modes: int) -> FloatArray:
     """Return the series of two modes of length 1 for `lanes.run`: 1 + 4 m terms."""
     series = mode_shapes(1.0, 2, reach).tables.series[:, : lanes.COLUMNS]
     more = -(len(series) - 1) % 4
-    return np.concatenate([series, np.zeros((more, lanes.COLUMNS))])
+    table = np.concatenate([series, np.zeros((more, lanes.COLUMNS))])
+    if modes == 1:
+        # The second mode has no effect.
+        table[:, lanes.SECOND] = 0.0
+    return table
+
+
+def lane_states(states: FloatArray) -> FloatArray:
+    """Return states of one mode, shape (..., 6), with a second one, (..., 8); else the same."""
+    if states.shape[-1] != len(_ONE_MODE):
+        return states
+    found = np.zeros((*states.shape[:-1], lanes.STATE))
+    found[..., _ONE_MODE] = states
+    return found

@@ -336,14 +336,15 @@ def test_batch_noise_is_encoder_noise() -> None:
         run_batch(law, NOMINAL, START, REFERENCE, late=-1, **options)
 
 
-def test_insertions_together_equal_batches_of_one() -> None:
+@pytest.mark.parametrize('modes', [1, 2])
+def test_insertions_together_equal_batches_of_one(modes: int) -> None:
     """Each with its own needle, reference, noise and delay; alone or not, to the bit."""
     law = InverseDynamics(
         axis=Axis.insertion(NOMINAL), gains=InverseDynamicsGains(), period=PERIOD
     )
     layers = {'layer_depths': (0.021,), 'layer_stiffnesses': (4e3,), 'swelling': 0.2}
     changes: list[dict[str, Any]] = [layers, {'friction_law': 'stribeck'}, {}]
-    models = [NeedleModel(replace(NOMINAL, **one)) for one in changes]
+    models = [NeedleModel(replace(NOMINAL, modes=modes, **one)) for one in changes]
     starts = [model.state_at(0.02, 2e-4) for model in models]
     targets = [Setpoint(0.02), Setpoint(0.02), Setpoint(0.0201)]
     references = [

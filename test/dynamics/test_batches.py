@@ -78,7 +78,7 @@ def test_bits_do_not_depend_on_the_number_of_workers(n: int) -> None:
 
 def assert_equal(found: FloatArray, exact: FloatArray, p: NeedleParameters) -> None:
     """Compare states: to the bit, except for needles that are computed together."""
-    if p.modes != 2 or p.formulation == 'as_printed':
+    if p.modes > 2 or p.formulation == 'as_printed':
         assert np.array_equal(found, exact)
         return
     # Rounding. With `tanh` it can change where a step is divided, by the error of such a part.
