@@ -8,19 +8,21 @@ with a loop of sums and products without data shared between threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 import tracemalloc
 from typing import Final
 
+from benchmarks.lanes_in_c import build, OPTIONS, Run
 from benchmarks.measure import Bar, least_times
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.solvers import DEFLECTION, DEPTH, DURATION, FORCE
 from benchmarks.step import chains
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, simulate_batch
+from needle_dynamics.compiled import lanes
 from needle_dynamics.compiled.intervals import run
-from needle_dynamics.simulated.batch import Batch
+from needle_dynamics.simulated.batch import Batch, lane_constants, lane_layers, lane_table
 import numpy as np
 
 #: Number of insertions.
@@ -48,6 +50,11 @@ class Batches:
             NeedleParameters.preset('paper_si', coulomb_friction=factor * preset.coulomb_friction)
             for factor in np.linspace(0.5, 1.5, runs)
         ]
+        self._arrays = (
+            lane_constants(self._parameters),
+            lane_table(preset.reach, preset.modes),
+            lane_layers(self._parameters),
+        )
 
     def run(
         self,
@@ -69,6 +76,19 @@ class Batches:
             keep=keep,
             workers=workers,
         )
+
+    def compiled(self, in_c: Run | None) -> FloatArray:
+        """Simulate without preparation, in C or by our compiled code; return final states."""
+        ends = np.tile(self._start, (len(self._parameters), 1))
+        needles, table, layers = self._arrays
+        if in_c is not None:
+            in_c(needles, table, FORCE, DURATION, _STEP, ends)
+            return ends
+        force, torque = np.array([[FORCE]]), np.zeros((1, 1))
+        inputs = lanes.BatchTrajectory(force, torque, 1, DURATION, _STEP, True)
+        kept, completed = np.empty((len(ends), 1, lanes.STATE)), np.empty(len(ends))
+        lanes.run(needles, table, layers, inputs, np.arange(len(ends)), ends, kept, completed)
+        return ends
 
     def one_by_one(self) -> FloatArray:
         """Simulate the insertions one after the other; return final states, (runs, 8)."""
@@ -103,10 +123,17 @@ def _spin(threads: int) -> None:
 
 def compare(tick: Tick) -> Answer:
     """Measure batches of insertions on one and two threads, and their memory."""
-    batches = Batches()
+    batches, in_c = Batches(), build()
     tick('batches, one thread and two')
+    alike: dict[str, Callable[[], object]] = {}
+    if in_c is not None:
+        alike = {
+            'compiled, ours': partial(batches.compiled, None),
+            'compiled, C': partial(batches.compiled, in_c),
+        }
     times = least_times(
         {
+            **alike,
             'one by one, 1': batches.one_by_one,
             'insertions, 1': partial(batches.run, 1),
             'insertions, 2': partial(batches.run, 2),
@@ -148,7 +175,8 @@ def compare(tick: Tick) -> Answer:
         f'of that is the preparation, in Python on one thread.\n'
         f'- One by one, in the same steps, it takes {times["one by one, 1"] / RUNS * 1e6:.3g} us, '
         f'{together:.3g} times as long: in a batch each instruction takes several needles. '
-        f'Depths and velocities at the end differ by at most {apart:.1g} of themselves.',
+        f'Depths and velocities at the end differ by at most {apart:.1g} of themselves.\n'
+        f'- {_compared_with_c(batches, in_c, times)}',
     )
     memory = PageSection(
         'Memory of batches',
@@ -165,4 +193,21 @@ def compare(tick: Tick) -> Answer:
         Bar('batches, 2 threads over 1', ratio, 1.8, 'x', at_least=True),
         Bar('batches, memory for 10 times the simulated time', long / short, 1.05, 'x'),
     ]
+    if alike:
+        ratio = times['compiled, ours'] / times['compiled, C']
+        bars.append(Bar('batches, over the same step in C', ratio, 1.3, 'x'))
     return [section, memory], bars
+
+
+def _compared_with_c(batches: Batches, in_c: Run | None, times: Mapping[str, float]) -> str:
+    if in_c is None:
+        return 'Not compared with C: there is no C compiler.'
+    ours, theirs = batches.compiled(None), batches.compiled(in_c)
+    scale = np.abs(ours).max(axis=0) + 1e-300
+    apart = float((np.abs(ours - theirs) / scale).max())
+    each = [1e6 * times[f'compiled, {name}'] / RUNS for name in ('ours', 'C')]
+    return (
+        f'The step in C, with the same arithmetic (`cc {" ".join(OPTIONS)}`), takes '
+        f'{each[1]:.3g} us for an insertion, and ours {each[0]:.3g} us, both without preparation, '
+        f'on one thread. The final states differ by at most {apart:.1g} of the largest.'
+    )
