@@ -26,7 +26,7 @@ RANK_TOLERANCE: Final = 1e-10  #: relative tolerance of the rank decision, in na
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Structure:
+class StateStructure:
     """Controllable or observable part of the state space."""
 
     order: int  #: number of states N
@@ -68,7 +68,7 @@ def controllability(
     names: tuple[str, ...],
     transform: ArrayLike | None = None,
     scaled_names: tuple[str, ...] | None = None,
-) -> Structure:
+) -> StateStructure:
     """Find the controllable states of (A, B), (N, N) and (N, M), and the PBH distances."""
     # In units of `LinearSystem.scaled`; ``names`` are of the states times ``transform``.
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
@@ -94,7 +94,7 @@ def controllability(
         directions = directions @ kept.T
     least = int(np.argmin(inner))
     leading = (scaled_names or names)[np.argmax(np.abs(directions[least]))]
-    return Structure(
+    return StateStructure(
         order=order,
         rank=kept.shape[1],
         lost=tuple(compress(names, ~reached)),
@@ -112,7 +112,7 @@ def observability(
     names: tuple[str, ...],
     transform: ArrayLike | None = None,
     scaled_names: tuple[str, ...] | None = None,
-) -> Structure:
+) -> StateStructure:
     """Find the observable states of (A, C), shapes as `controllability` of the dual pair."""
     dual = None if transform is None else np.linalg.inv(np.asarray(transform, dtype=float)).T
     a, c = np.asarray(a, dtype=float), np.asarray(c, dtype=float)
@@ -149,8 +149,8 @@ def _hautus(a: FloatArray, b: FloatArray) -> tuple[ComplexArray, FloatArray, Com
 class Analysis:
     """Controllability and observability of a linear system."""
 
-    state: Structure  #: state controllability
-    observed: Structure  #: observability from the tip deflection
+    state: StateStructure  #: state controllability
+    observed: StateStructure  #: observability from the tip deflection
     #: Whether the tip deflection is output controllable. With one output the matrix
     #: [CB, CAB, ..., D] needs rank 1: the number of outputs, not of inputs.
     output_controllable: bool

@@ -11,7 +11,12 @@ from pathlib import Path
 from typing import Any, Final, TYPE_CHECKING
 
 from needle_dynamics import analyze, linearize, NeedleModel, NeedleParameters
-from needle_dynamics.analysis import Analysis, controllability_map, ControllabilityMap, Structure
+from needle_dynamics.analysis import (
+    Analysis,
+    controllability_map,
+    ControllabilityMap,
+    StateStructure,
+)
 from needle_dynamics.linearization import LinearSystem, operating_point
 from needle_insertion.report.content import png
 from needle_ros.files import write_whole
@@ -87,11 +92,11 @@ class OperatingPoint:
         }
 
 
-def _cells(found: Structure) -> tuple[str, ...]:
+def _cells(found: StateStructure) -> tuple[str, ...]:
     return f'{found.rank}/{found.order}', found.loss, f'{found.margin:.1e}', found.weakest
 
 
-def _structure(found: Structure) -> dict[str, Any]:
+def _structure(found: StateStructure) -> dict[str, Any]:
     names = (
         *('order', 'rank', 'deficiency', 'lost', 'combined', 'loss', 'distance', 'margin'),
         'weakest',
