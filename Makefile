@@ -3,7 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_study needle_insertion reproduction benchmarks examples test description launch docs tools setup.py
+SOURCES := needle_ros needle_dynamics needle_controller needle_identification needle_study needle_planning needle_insertion reproduction benchmarks examples test description launch docs tools setup.py
 
 .PHONY: demo test check docs format setup compiled wheel lock bags results bench clean
 

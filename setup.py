@@ -18,6 +18,8 @@ SLICER = ['pyigtl>=0.3.4']
 STUDY = ['pyarrow>=15']
 DASK = [*STUDY, 'distributed>=2024.5']
 GYM = ['gymnasium>=1.1']
+#: Readers of segmentations.
+PLAN = ['nibabel>=5.2', 'pynrrd>=1.0', 'trimesh>=4.0']
 #: Results as a DataFrame, `to_dataframe`.
 PANDAS = ['pandas>=2.0']
 TEST = [
@@ -33,6 +35,7 @@ TEST = [
     *DASK,
     *GYM,
     *PANDAS,
+    *PLAN,
 ]
 
 
@@ -140,6 +143,7 @@ setup(
         'dask': DASK,
         'gym': GYM,
         'pandas': PANDAS,
+        'plan': PLAN,
         # Reference tools of `needle bench`.
         'bench': [
             'mcap-ros2-support>=0.5.6',

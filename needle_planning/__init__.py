@@ -1,2 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans of an insertion in a segmented image, without ROS."""
+
+from typing import TYPE_CHECKING
+
+from needle_ros.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from needle_planning.anatomy import Anatomy as Anatomy
+    from needle_planning.anatomy import ROLES as ROLES
+    from needle_planning.anatomy import SegmentationError as SegmentationError
+    from needle_planning.anatomy import Structure as Structure
+    from needle_planning.labels import read_anatomy as read_anatomy
+else:
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

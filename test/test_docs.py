@@ -42,7 +42,13 @@ RUN: dict[str, str | tuple[str, ...]] = {
 
 
 #: Packages with exported names.
-PACKAGES = ('needle_dynamics', 'needle_controller', 'needle_identification', 'needle_study')
+PACKAGES = (
+    'needle_dynamics',
+    'needle_controller',
+    'needle_identification',
+    'needle_study',
+    'needle_planning',
+)
 
 #: Python files of all installed packages.
 SOURCES = sorted([*ROOT.glob('needle_*/**/*.py'), *ROOT.glob('reproduction/**/*.py')])

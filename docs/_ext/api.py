@@ -25,6 +25,7 @@ PACKAGES = (
     'needle_controller',
     'needle_identification',
     'needle_study',
+    'needle_planning',
     'needle_insertion',
     'reproduction',
 )

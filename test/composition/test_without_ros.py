@@ -113,7 +113,14 @@ def test_commands_of_the_library_work(tmp_path: Path, words: tuple[object, ...])
 
 
 @pytest.mark.parametrize(
-    'package', ['needle_dynamics', 'needle_controller', 'needle_identification', 'needle_study']
+    'package',
+    [
+        'needle_dynamics',
+        'needle_controller',
+        'needle_identification',
+        'needle_study',
+        'needle_planning',
+    ],
 )
 def test_packages_of_the_library_are_imported(tmp_path: Path, package: str) -> None:
     ended = run(tmp_path, '-c', f'import {package}')

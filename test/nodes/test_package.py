@@ -51,7 +51,9 @@ KEYS = {
 }
 
 #: Extras of setup.py without a rosdep key; the code that needs them reports the installation.
-EXTRAS = {'distributed', 'gymnasium', 'pandas', 'pyarrow', 'pyigtl'}
+EXTRAS = {
+    'distributed', 'gymnasium', 'nibabel', 'nrrd', 'pandas', 'pyarrow', 'pyigtl', 'trimesh',
+}  # fmt: skip
 
 OWN = {*(path.parent.name for path in ROOT.glob('needle_*/__init__.py')), 'reproduction'}
 
