@@ -19,6 +19,7 @@ EXAMPLES, NOTEBOOKS = ROOT / 'examples', ROOT / 'docs/notebooks'
 
 #: Required output of each script, as a pattern.
 PRINTED = {
+    'anatomy': r'tumor: target, 3\.0 ml',
     'aiming': r'steered: 0\.0\d mm from the target\nopen loop: 6\.\d\d mm',
     'batch': r'median \d+\.\d mm, 95 % of them between',
     'inference': r'bending length: intervals of 95 % hold 9\d\.\d % of the true values',
