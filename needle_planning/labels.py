@@ -268,9 +268,9 @@ class _Painted:
     @classmethod
     def empty(cls, layer: Layer, others: int) -> _Painted:
         """Return a grid without structures, beside others of so many voxels."""
-        if prod(layer.values.shape) + others > MOST_VOXELS:
+        if prod(layer.values.shape) + others > 2 * MOST_VOXELS:
             raise SegmentationError(
-                f'the grids have more than {MOST_VOXELS} voxels: crop or resample them'
+                f'the grids have more than {2 * MOST_VOXELS} voxels: crop or resample them'
             )
         return cls(np.zeros_like(layer.values, np.uint8), layer.to_patient)
 

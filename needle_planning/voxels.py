@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 Values: TypeAlias = NDArray[np.unsignedinteger]  #: values of voxels, 0 for the background
 
-#: Largest number of voxels of a file, and of all grids: 0.8 GB are used to read so many.
+#: Largest number of voxels of a file; all grids have twice as many. 1.4 GB are used at most.
 MOST_VOXELS: Final = 2**28
 LARGEST_VALUE: Final = 2**16 - 1  #: Largest value of a voxel.
 

@@ -7,7 +7,7 @@ from math import isnan
 from pathlib import Path
 from typing import Any
 
-from needle_planning import read_anatomy
+from needle_planning import read_anatomy, SegmentationError
 from needle_planning.labels import read_labels
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -200,3 +200,19 @@ def test_no_file_is_rejected(tmp_path: Path) -> None:
     labels = write_labels(tmp_path / 'labels.yaml', ROLES)
     with pytest.raises(ParameterError, match='at least one segmentation'):
         read_anatomy([], labels)
+
+
+def test_number_of_voxels_of_all_grids_is_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Grids of 12 voxels each, with a smaller limit."""
+    paths = [
+        write_nifti(tmp_path / f'{k}.nii', blocks(1), AFFINE + 1e-2 * k * np.eye(4, k=3))
+        for k in range(3)
+    ]
+    labels = write_labels(tmp_path / 'labels.yaml', {'0': ROLES[1]}, others={'role': 'tissue'})
+    assert len(read_anatomy(paths, labels)) == 3
+    monkeypatch.setattr('needle_planning.labels.MOST_VOXELS', 17)
+    assert len(read_anatomy(paths[:2], labels)) == 2
+    with pytest.raises(SegmentationError, match='the grids have more than 34 voxels'):
+        read_anatomy(paths, labels)
