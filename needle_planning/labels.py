@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from math import prod
 from pathlib import Path
+from reprlib import repr as short
 from typing import Any, Final
 
 from needle_dynamics import FloatArray
@@ -101,13 +102,13 @@ def read_labels(path: Path | str) -> Labels:
 
 def _labels(document: Any) -> Labels:
     if not isinstance(document, Mapping):
-        raise ParameterError(f'labels have the keys {", ".join(_TOP)}, got {document!r}')
+        raise ParameterError(f'labels have the keys {", ".join(_TOP)}, got {short(document)}')
     if unknown := [key for key in document if key not in _TOP]:
         raise ParameterError(unknown_name(str(unknown[0]), _TOP))
     given = document.get('structures')
     if not isinstance(given, Mapping) or not 0 < len(given) <= _MOST:
         raise ParameterError(
-            f'structures must have 1 to {_MOST} labels with a role, got {given!r}'
+            f'structures must have 1 to {_MOST} labels with a role, got {short(given)}'
         )
     for key in given:
         is_value = isinstance(key, int) and not isinstance(key, bool)
@@ -117,9 +118,9 @@ def _labels(document: Any) -> Labels:
                 + ('; write a name in quotes' if isinstance(key, bool) else '')
             )
     read = {key: _structure(f'structures: {key}', str(key), one) for key, one in given.items()}
-    everything: dict[int | str, Structure] = read
-    order = sorted(read, key=lambda key: _priority(read[key]))
-    structures = {number: everything[key] for number, key in enumerate(order, 1)}
+    ranked = sorted(read.items(), key=lambda item: _rank(item[1]))
+    numbers = {key: number for number, (key, _) in enumerate(ranked, 1)}
+    structures = {number: one for number, (_, one) in enumerate(ranked, 1)}
     others = 0
     if 'others' in document:
         others = len(structures) + 1
@@ -129,7 +130,7 @@ def _labels(document: Any) -> Labels:
     if 'space' in document:
         check_choice('space', document['space'], SPACES)
     grid = from_values(_Grid, {key: document[key] for key in _TOP[2:] if key in document})
-    return Labels(structures, {key: number for number, key in enumerate(order, 1)}, others, grid)
+    return Labels(structures, numbers, others, grid)
 
 
 def _structure(where: str, name: str, given: Any) -> Structure:
@@ -153,7 +154,7 @@ def _structure(where: str, name: str, given: Any) -> Structure:
     return Structure(**{'name': name, **{key: getattr(entry, key) for key in given}})
 
 
-def _priority(one: Structure) -> tuple[int, float]:
+def _rank(one: Structure) -> tuple[int, float]:
     """Return the rank of a structure: where structures overlap, the smallest is kept."""
     return ('obstacle', 'target', 'entry', 'tissue').index(one.role), -one.margin
 

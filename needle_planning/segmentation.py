@@ -163,7 +163,7 @@ def _nrrd(path: Path, stack: ExitStack, space: str) -> tuple[Values, FloatArray,
     data = stack.enter_context(_valid(header, 'encoding', _ENCODINGS)(stream))
     data.seek(max(skip, 0), 1)
     matrix, is_list = _nrrd_matrix(header, len(shape), space)
-    segments = _segments(header)
+    segments = _segments(header, shape[0] if is_list else 1)
     if len(shape) == 4 and shape[0] > 1 and not segments:
         raise SegmentationError(
             f'has 4 axes ({" x ".join(map(str, shape))}): a segmentation of 3D Slicer has the '
@@ -188,7 +188,7 @@ def _nrrd_header(path: Path, stream: BinaryIO) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter('ignore')
-            header = dict(nrrd.read_header(text.splitlines()))
+            header = dict(nrrd.read_header(text.split('\n')))
         missing = {'type', 'dimension', 'sizes', 'encoding'} - header.keys()
         if missing or header['dimension'] != len(header['sizes']):
             raise ValueError(f'{", ".join(sorted(missing)) or "sizes"} missing')
@@ -239,7 +239,7 @@ def _nrrd_matrix(header: Mapping[str, Any], axes: int, space: str) -> tuple[Floa
     return to_ras(matrix, of_file, unit), is_list
 
 
-def _segments(header: Mapping[str, Any]) -> list[_Segment]:
+def _segments(header: Mapping[str, Any], layers: int) -> list[_Segment]:
     """Return the segments of 3D Slicer; before its version 4.11 each is a layer of its own."""
     found = []
     for key in header:
@@ -248,7 +248,7 @@ def _segments(header: Mapping[str, Any]) -> list[_Segment]:
         numbers = [header.get(f'{match[1]}{field}', '') for field in ('Layer', 'LabelValue')]
         layer, value = (
             int(text) if re.fullmatch(r'\d{1,6}', text) else default
-            for text, default in zip(numbers, (int(match[2]), 1), strict=True)
+            for text, default in zip(numbers, (min(int(match[2]), layers - 1), 1), strict=True)
         )
         found.append(_Segment(header[key], layer, value))
     return found

@@ -169,6 +169,17 @@ def test_old_segments_of_slicer_are_layers(tmp_path: Path) -> None:
     assert positions_of(anatomy, 'b')[:, 0] == pytest.approx(np.full(4, -1e-3))
 
 
+def test_segments_of_one_image_need_no_layer(tmp_path: Path) -> None:
+    """Segments are told apart by their values alone; a name may have any characters."""
+    fields = {'Segment0_Name': 'a: = b', 'Segment0_LabelValue': '2', 'Segment1_Name': 'c\x0bd'}
+    anatomy = read(
+        write_nrrd(tmp_path / 'a.seg.nrrd', IMAGE, LPS @ AFFINE, **fields),
+        {'a: = b': ROLES[2], 'c\x0bd': ROLES[1]},
+    )
+    sizes = [int(np.sum(anatomy.labels == number)) for number in (1, 2)]
+    assert sizes == [int(np.sum(number == IMAGE)) for number in (1, 2)]
+
+
 @pytest.mark.parametrize('encoding', ['raw', 'gzip', 'bzip2'])
 @pytest.mark.parametrize('detached', [False, True])
 def test_encodings_of_nrrd_are_the_same(encoding: str, detached: bool, tmp_path: Path) -> None:
@@ -259,3 +270,21 @@ def test_scaled_values_are_those_of_nibabel(tmp_path: Path) -> None:
     anatomy = read(path, {1: ROLES[2], 4: ROLES[1], 7: ROLES[2]})
     assert len(anatomy.structures) == 3
     assert np.sum(anatomy.labels == 1) == np.sum(IMAGE == 1)
+
+
+@pytest.mark.parametrize(
+    ('labels', 'matrix', 'reason'),
+    [
+        (np.zeros((2, 2), int), np.eye(4), r'shape \(i, j, k\), got int64 of shape \(2, 2\)'),
+        (np.zeros((2, 0, 2), int), np.eye(4), r'got int64 of shape \(2, 0, 2\)'),
+        (np.zeros((2, 2, 2)), np.eye(4), 'must be whole numbers'),
+        (np.zeros((2, 2, 2), int), np.eye(3), '4 x 4 finite numbers'),
+        (np.zeros((2, 2, 2), int), np.eye(4) + np.eye(4, k=-3), 'is singular'),
+        (np.zeros((2, 2, 2), int), np.diag([1.0, 0.0, 1.0, 1.0]), 'is singular'),
+        (np.zeros((2, 2, 2), int), np.diag([1e200, 1.0, 1.0, 1.0]), 'are not of a patient'),
+        (np.zeros((2, 2, 2), int), np.eye(4) + 1e-3 * np.eye(4, k=1), 'at most 0.0001 is accept'),
+    ],
+)
+def test_invalid_anatomy_is_rejected(labels: np.ndarray, matrix: np.ndarray, reason: str) -> None:
+    with pytest.raises(SegmentationError, match=reason):
+        Anatomy(labels=labels, to_patient=matrix, structures={})
