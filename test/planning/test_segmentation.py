@@ -282,7 +282,11 @@ def test_scaled_values_are_those_of_nibabel(tmp_path: Path) -> None:
         (np.zeros((2, 2, 2), int), np.eye(4) + np.eye(4, k=-3), 'is singular'),
         (np.zeros((2, 2, 2), int), np.diag([1.0, 0.0, 1.0, 1.0]), 'is singular'),
         (np.zeros((2, 2, 2), int), np.diag([1e200, 1.0, 1.0, 1.0]), 'are not of a patient'),
-        (np.zeros((2, 2, 2), int), np.eye(4) + 1e-3 * np.eye(4, k=1), 'at most 0.0001 is accept'),
+        (
+            np.zeros((2, 2, 2), int),
+            np.diag([0.1, 0.1, 0.1, 1.0]) + np.diag([1e-4, 0.0, 0.0], k=1),
+            'at most 0.0001 is accept',
+        ),
     ],
 )
 def test_invalid_anatomy_is_rejected(labels: np.ndarray, matrix: np.ndarray, reason: str) -> None:

@@ -12,7 +12,7 @@ from needle_planning.surfaces import voxels_inside
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
-from support.segmentations import positions_of, ROLES, write_labels
+from support.segmentations import assert_same_positions, positions_of, ROLES, write_labels
 import trimesh
 
 SHAPE = (9, 8, 7)
@@ -25,16 +25,33 @@ def box(low: tuple[float, ...], high: tuple[float, ...]) -> np.ndarray:
     return np.asarray(trimesh.creation.box(bounds=[low, high]).triangles)
 
 
-@given(seed=st.integers(0, 2**32 - 1), count=st.integers(4, 30))
-def test_voxels_inside_of_a_convex_surface_satisfy_its_half_spaces(seed: int, count: int) -> None:
-    """The hull of random points; it may reach beyond the grid on every side."""
-    points = np.random.default_rng(seed).uniform(-3.0, 11.0, (count, 3))
+def assert_inside_half_spaces(points: np.ndarray, random: np.random.Generator) -> None:
+    """Compare the voxels inside of a convex hull with its half spaces."""
     hull = ConvexHull(points)
-    inside = voxels_inside(points[hull.simplices], SHAPE)
+    # Both triangles of an edge have it in any direction.
+    triangles = random.permuted(hull.simplices, axis=1)
+    inside = voxels_inside(points[triangles], SHAPE)
     distance = np.max(CENTERS @ hull.equations[:, :3].T + hull.equations[:, 3], -1)
     # Rounding of coordinates of 10.
     clear = np.abs(distance) > 1e-9
     np.testing.assert_array_equal(inside[clear], distance[clear] < 0.0)
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(4, 30))
+def test_voxels_inside_of_a_convex_surface_satisfy_its_half_spaces(seed: int, count: int) -> None:
+    """The hull of random points; it may reach beyond the grid on every side."""
+    random = np.random.default_rng(seed)
+    assert_inside_half_spaces(random.uniform(-3.0, 11.0, (count, 3)), random)
+
+
+def test_edge_through_a_column_is_crossed_once() -> None:
+    """Rounding puts the edge on either side of the column, for both of its triangles on one."""
+    random = np.random.default_rng(1)
+    for _ in range(1000):
+        along = random.normal(size=3)
+        ends = np.array([4.0, 4.0, 3.3]) + np.outer(random.uniform(0.5, 2.0, 2) * [-1, 1], along)
+        others = random.uniform(-3.0, 11.0, (2, 3))
+        assert_inside_half_spaces(np.concatenate([ends, others]), random)
 
 
 @given(
@@ -90,6 +107,29 @@ def test_folder_of_surfaces_is_one_anatomy(text: bool, tmp_path: Path) -> None:
     assert volumes == pytest.approx(4 / 3 * np.pi * np.array([6.0, 20.0]) ** 3, rel=0.02)
     np.testing.assert_allclose(vessel.mean(0), [-0.030, -0.020, -0.010], atol=1e-4)
     assert np.max(np.linalg.norm(vessel - [-0.030, -0.020, -0.010], axis=1)) < 6e-3
+
+
+def test_same_numbers_in_the_other_space_are_the_mirrored_anatomy(tmp_path: Path) -> None:
+    """Positions of the voxels, too, for a surface that does not fit their spacing."""
+    mesh = trimesh.creation.icosphere(radius=7.3)
+    mesh.apply_translation([20.13, 9.4, -31.7])
+    mesh.export(tmp_path / 'a.stl')
+    found = []
+    for space in ('RAS', 'LPS'):
+        labels = write_labels(tmp_path / 'labels.yaml', {'a': ROLES[1]}, space=space)
+        (anatomy,) = read_anatomy(tmp_path / 'a.stl', labels)
+        found.append(positions_of(anatomy, 'a'))
+    assert_same_positions(found[0] * [-1.0, -1.0, 1.0], found[1])
+
+
+def test_triangles_without_area_do_not_open_a_surface(tmp_path: Path) -> None:
+    """Some programs write them."""
+    corners = BOX.triangles * 10.0
+    flat = corners[0][[0, 0, 1]]
+    trimesh.Trimesh(**trimesh.triangles.to_kwargs([*corners, flat])).export(tmp_path / 'a.stl')
+    labels = write_labels(tmp_path / 'labels.yaml', {'a': ROLES[1]}, space='RAS')
+    (anatomy,) = read_anatomy(tmp_path / 'a.stl', labels)
+    assert len(positions_of(anatomy, 'a')) == 1000
 
 
 @settings(max_examples=10)
