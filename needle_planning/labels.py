@@ -15,8 +15,8 @@ from needle_dynamics import FloatArray
 from needle_planning.anatomy import Anatomy, ROLES, SegmentationError, Structure
 from needle_planning.segmentation import read_layers
 from needle_planning.voxels import LARGEST_VALUE, Layer, MOST_VOXELS, planes, present, SPACES
-from needle_ros.errors import ParameterError
-from needle_ros.files import DocumentError, read_document
+from needle_ros.errors import ParameterError, shown
+from needle_ros.files import DocumentError, LARGEST, read_document
 from needle_ros.settings import (
     check_choice,
     CheckedSettings,
@@ -92,7 +92,8 @@ def read_labels(path: Path | str) -> Labels:
         If it is not readable or invalid, with its name and the valid keys.
     """
     try:
-        return _labels(read_document(Path(path).read_text(encoding='utf-8')))
+        with Path(path).open(encoding='utf-8') as stream:
+            return _labels(read_document(stream.read(LARGEST + 1)))
     except (DocumentError, ParameterError) as error:
         raise ParameterError(f'{path}: {error}') from error
     except (OSError, UnicodeDecodeError) as error:
@@ -151,7 +152,9 @@ def _structure(where: str, name: str, given: Any) -> Structure:
     if 'stiffness' not in given and ('spread' in given or 'source' in given):
         raise ParameterError(f'{where} has a spread or a source, but no stiffness')
     entry = from_values(_Entry, given, f'{where}.')
-    return Structure(**{'name': name, **{key: getattr(entry, key) for key in given}})
+    values = {key: getattr(entry, key) for key in given}
+    # It may be a name of an external file, and is printed.
+    return Structure(**{**values, 'name': shown(entry.name or name)})
 
 
 def _rank(one: Structure) -> tuple[int, float]:

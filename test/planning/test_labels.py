@@ -5,8 +5,11 @@ from __future__ import annotations
 
 from math import isnan
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from needle_planning import read_anatomy, SegmentationError
 from needle_planning.labels import read_labels
 from needle_ros.errors import ParameterError
@@ -20,6 +23,7 @@ from support.segmentations import (
     write_nifti,
     write_nrrd,
 )  # fmt: skip
+import yaml
 
 AFFINE = np.diag([2.0, 2.0, 2.0, 1.0])
 
@@ -109,6 +113,56 @@ def test_unreadable_labels_are_rejected(content: bytes | None, tmp_path: Path) -
         path.write_bytes(content)
     with pytest.raises(ParameterError, match=r'No such file|it is not text'):
         read_labels(path)
+
+
+def test_names_cannot_control_a_terminal(tmp_path: Path) -> None:
+    text = '{structures: {"a\\e[2J": {role: obstacle, margin: 1mm}}}'
+    assert read_labels(written(tmp_path, text)).structures[1].name == 'a?[2J'
+
+
+def test_long_labels_are_rejected_before_they_are_read(tmp_path: Path) -> None:
+    path = tmp_path / 'labels.yaml'
+    with path.open('wb') as stream:
+        stream.truncate(2**33)
+    with pytest.raises(ParameterError, match='has 1048577 characters, at most 1048576 are read'):
+        read_labels(path)
+
+
+#: Scalars of YAML, with those that labels may have.
+SCALARS = (
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
+    | st.sampled_from(['obstacle', 'tissue', '2mm', '1e-3', 'RAS', 3, 0.3])
+)  # fmt: skip
+ENTRIES = st.dictionaries(
+    st.sampled_from(['role', 'name', 'margin', 'stiffness', 'spread', 'source']) | SCALARS,
+    SCALARS | st.lists(SCALARS, max_size=2),
+    max_size=4,
+)
+
+
+@settings(max_examples=300)
+@given(
+    st.dictionaries(
+        st.sampled_from(['structures', 'others', 'space', 'spacing']) | SCALARS,
+        SCALARS | ENTRIES | st.dictionaries(SCALARS, SCALARS | ENTRIES, max_size=3),
+        max_size=4,
+    ),
+    ENTRIES,
+)
+def test_labels_are_read_or_rejected(document: dict[Any, Any], entry: dict[Any, Any]) -> None:
+    """Documents of any content, and of valid content with one random structure."""
+    for one in (document, {'structures': {1: ROLES[1], 'a': entry}}):
+        with TemporaryDirectory() as folder:
+            path = Path(folder, 'labels.yaml')
+            path.write_text(yaml.safe_dump(one), 'utf-8')
+            try:
+                labels = read_labels(path)
+            except ParameterError as error:
+                line = str(error)
+            else:
+                assert set(labels.numbers.values()) <= set(labels.structures)
+                line = ', '.join(found.name for found in labels.structures.values())
+        assert line.isprintable()
 
 
 @pytest.mark.parametrize(
