@@ -32,6 +32,16 @@ def write_whole(path: Path | str, content: bytes) -> None:
 class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
     """The loader of LibYAML, ten times as fast but not always installed, with more numbers."""
 
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        found: dict[Any, Any] = super().construct_mapping(node, deep=deep)
+        if len(found) < len(node.value):
+            # YAML requires unique keys; the parser would keep the last one.
+            keys = [self.construct_object(key, deep=deep) for key, _ in node.value]
+            twice = next(key for key in keys if keys.count(key) > 1)
+            line = node.start_mark.line + 1
+            raise DocumentError(f'has the key {twice!r} twice in the mapping of line {line}')
+        return found
+
 
 # Numbers such as 4e-5 are text in YAML 1.1; they are numbers in YAML 1.2.
 _Loader.add_implicit_resolver(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Values of YAML documents."""
 
-from needle_ros.files import read_document
+from needle_ros.files import DocumentError, read_document
 import pytest
 
 
@@ -24,3 +24,15 @@ def test_numbers_with_an_exponent_are_read(text: str, value: object) -> None:
     """As in YAML 1.2, also without a point or a sign, and within lists and mappings."""
     assert read_document(text) == value
     assert read_document(f'{{a: [{text}, 1]}}') == {'a': [value, 1]}
+
+
+@pytest.mark.parametrize(
+    ('text', 'line'),
+    [('vein: {role: obstacle}\nvein: {role: tissue}', 1), ('a: 1\nb:\n  c: 1\n  c: 1', 3)],
+)
+def test_repeated_key_is_rejected(text: str, line: int) -> None:
+    """The last value would silently replace the others."""
+    with pytest.raises(
+        DocumentError, match=f"the key '[a-z]+' twice in the mapping of line {line}$"
+    ):
+        read_document(text)
