@@ -35,7 +35,7 @@ MODULES: Final = (
     'needle_dynamics.compiled.integrals',
     'needle_dynamics.compiled.normal_modes',
     # Needs Gymnasium, which is optional.
-    *(('needle_study.gym.pushed',) if find_spec('gymnasium') else ()),
+    *(('needle_study.gym.pushed', 'needle_study.gym.steered') if find_spec('gymnasium') else ()),
 )
 
 

@@ -13,4 +13,8 @@ gymnasium.register(
     vector_entry_point='needle_study.gym.insertion:InsertionVectorEnv',
     max_episode_steps=500,
 )
-gymnasium.register('NeedleSteering-v0', 'needle_study.gym.steering:SteeringEnv')
+gymnasium.register(
+    'NeedleSteering-v0',
+    'needle_study.gym.steering:SteeringEnv',
+    vector_entry_point='needle_study.gym.steering:SteeringVectorEnv',
+)

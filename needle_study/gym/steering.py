@@ -1,27 +1,164 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gymnasium environment of a needle whose guide steers its tip."""
+"""Gymnasium environment of a needle whose guide steers its tip, single or vectorized."""
 
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from math import atan2, ceil, exp, inf, sqrt
 from typing import Any, ClassVar, Final
 
-import gymnasium
 from gymnasium import spaces
 from needle_controller import SIMULATION_LIMITS, SteeringPrior
-from needle_controller.steering.law import GuideSetpoint
-from needle_controller.steering.simulation import sample_truth, SteeringPlant, step_depths
-from needle_dynamics import DEFAULT_NEEDLE, find_needle, FloatArray
+from needle_controller.steering.law import checked_target
+from needle_controller.steering.simulation import GroundTruth, step_depths
+from needle_dynamics import (
+    DEFAULT_NEEDLE,
+    find_needle,
+    FloatArray,
+    NeedleParameters,
+    SteeringParameters,
+)
+from needle_dynamics.compiled.boxed import Boxed
+from needle_dynamics.compiled.cutting_needle import DEPTH
+from needle_dynamics.steering.needle import empty_cut, steered, wandering
+from needle_dynamics.steering.parameters import longest_element, with_lengths
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_choice
-from needle_study.gym.environment import checked_actions, picture
+from needle_study.gym.environment import NeedleEnv, NeedleVectorEnv, picture
 from needle_study.gym.pushed import BOUND
+from needle_study.gym.steered import (
+    begin,
+    CAUSES,
+    Cuts,
+    observe,
+    Population,
+    sample,
+    Springs,
+    steer,
+    SteeredNeedles,
+)
 import numpy as np
 
 #: Default distribution of the unknown disturbances of a needle.
 PRIOR: Final = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1)
 
-_SEEDS: Final = 2**63  #: upper bound of the seeds of paths
+_FPS: Final = {'render_fps': 2}
 
 
-class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
+class _Needles:
+    def __init__(
+        self,
+        needle: str,
+        depth: float,
+        step_length: float,
+        guide_limit: float,
+        aside: float,
+        prior: SteeringPrior,
+        number: int,
+    ) -> None:
+        names = 'depth', 'step_length', 'guide_limit', 'aside'
+        sizes = dict(zip(names, (depth, step_length, guide_limit, aside), strict=True))
+        for name, value in sizes.items():
+            if not 0.0 < value < inf:
+                raise ParameterError(f'{name} must be positive and finite, got {value!r} m')
+        self._needle, steering, _ = find_needle(needle)
+        reach = self._needle.length - steering.free_length
+        if depth > reach:
+            raise ParameterError(f'depth must be <= {reach:g} m with this needle, got {depth!r} m')
+        self._steering = replace(
+            steering, path_noise=prior.path_noise, path_noise_length=prior.path_noise_length
+        )
+        self._depths, self._number = step_depths(depth, step_length), number
+        self._prior, self._limit, self._aside = prior, guide_limit, aside
+        self.action_space = spaces.Box(-1.0, 1.0, (2,))
+        self.observation_space = spaces.Box(-BOUND, BOUND, (7,))
+        self._allocate_population()
+
+    def _allocate_population(self) -> None:
+        # The shortest elements are those in the stiffest tissue.
+        stiffest, _ = with_lengths(self._needle, self._steering, 1.0 - self._prior.spread)
+        element = longest_element(stiffest, self._steering)
+        self._allocate(self._needle, self._steering, element)
+        self._replaced = False
+
+    def _allocate(
+        self, needle: NeedleParameters, steering: SteeringParameters, element: float
+    ) -> None:
+        """Allocate needles whose elements are at least this long [m]."""
+        nominal, n, prior = steered(needle, steering), self._number, self._prior
+        depth, layers, points = self._depths[-1], len(nominal.starts), len(self._depths)
+        cells = ceil(depth / nominal.cell) + 2
+        cut = empty_cut(depth, element, layers)
+        springs, *others = (
+            [np.array([one] * n) for one in part] for part in (cut.springs, cut[1:])
+        )
+        self._needles = SteeredNeedles(
+            population=Population(
+                nominal=nominal._replace(element=min(steering.element, nominal.cell)),
+                free=steering.free_length,
+                spread=prior.spread,
+                tilt=prior.tilt,
+                frame=prior.frame,
+                bevel=prior.bevel,
+                noise=prior.noise,
+                keep=exp(-nominal.cell / steering.path_noise_length),
+                turn=sqrt(steering.path_noise / (2.0 * steering.path_noise_length)),
+                aside=self._aside,
+                limit=self._limit,
+            ),
+            depths=self._depths,
+            constants=np.zeros((n, 6)),
+            layers=np.zeros((n, 3, layers)),
+            wander=np.zeros((n, cells, 2)),
+            cuts=Cuts(Springs(*springs), *others[0]),
+            frame=np.zeros((n, 2)),
+            noise=np.zeros((n, points, 2)),
+            targets=np.zeros((n, 2)),
+            steps=np.zeros(n, dtype=np.int64),
+        )
+        self._boxed, self._rows = Boxed(self._needles), CAUSES + points + cells
+
+    def begin(self, k: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        truth = options.get('truth')
+        if truth is not None:
+            element = longest_element(truth.needle, truth.steering)
+            self._allocate(truth.needle, truth.steering, element)
+            self._replaced = True
+        elif self._replaced:
+            self._allocate_population()
+        sample(self._boxed, k, rng.uniform(-1.0, 1.0, 4), rng.standard_normal((self._rows, 2)))
+        if truth is not None:
+            self._place(k, truth)
+        if 'target' in options:
+            self._needles.targets[k] = checked_target(options['target'])
+
+    def _place(self, k: int, truth: GroundTruth) -> None:
+        """Replace needle k, and place it on the skin."""
+        n, constants = self._needles, steered(truth.needle, truth.steering)
+        n.constants[k] = constants[:6]
+        n.layers[k] = constants.starts, constants.stiffness, constants.bevel
+        n.wander[k] = 0.0
+        if truth.steering.path_noise > 0.0:
+            n.wander[k] = wandering(truth.needle, truth.steering, truth.seed)[: n.wander.shape[1]]
+        n.frame[k] = truth.frame
+        begin(self._boxed, k, np.array(truth.tilt), atan2(*truth.bevel))
+
+    def step(self, actions: FloatArray, which: Any) -> tuple[FloatArray, Any]:
+        return steer(self._boxed, actions, which)
+
+    def observe(self) -> FloatArray:
+        found, self._tips = observe(self._boxed)
+        return np.asarray(found)
+
+    def info(self, _ends: Any) -> dict[str, Any]:
+        return {'tip': self._tips[:, :2], 'miss': self._tips[:, 2]}
+
+    def picture(self, k: int) -> Any:
+        depth, deepest = self._needles.cuts.pose[k, DEPTH], float(self._depths[-1])
+        target = deepest, self._needles.targets[k, 1]
+        return picture(1.1 * deepest, self._limit, (depth, self._tips[k, 1]), target)
+
+
+class SteeringEnv(NeedleEnv):
     """
     Steer the tip to a target in steps of a needle; needle, tissue and target are sampled.
 
@@ -30,11 +167,13 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
     needles. The action is the position of the guide for the next step, as a fraction of its limit.
     The observation is the depth over the target depth, and as fractions of the guide limit the
     measured tip, the target and the guide, each x and z. The reward at the end is the negative
-    distance of the tip from the target [mm], before it is 0. Then the info has ``miss``, the
-    distance [m]; it always has ``tip``, the true tip in x and z [m]. Images show the plane of z.
+    distance of the tip from the target [mm], before it is 0. Info: ``tip``, the true tip in x and
+    z [m]; ``miss``, its distance from the target in this plane [m]. Images show the plane of z.
+
+    Options of `reset`: ``truth``, a `GroundTruth`, and ``target``, x and z [m].
     """
 
-    metadata: ClassVar[dict[str, Any]] = {'render_modes': ['rgb_array'], 'render_fps': 2}
+    metadata: ClassVar[dict[str, Any]] = {**NeedleEnv.metadata, **_FPS}
 
     def __init__(
         self,
@@ -47,61 +186,26 @@ class SteeringEnv(gymnasium.Env[FloatArray, FloatArray]):
         prior: SteeringPrior = PRIOR,
         render_mode: str | None = None,
     ) -> None:
-        if render_mode is not None:
-            check_choice('render_mode', render_mode, self.metadata['render_modes'])
-        self.render_mode = render_mode
-        names = 'depth', 'step_length', 'guide_limit', 'aside'
-        sizes = dict(zip(names, (depth, step_length, guide_limit, aside), strict=True))
-        for name, value in sizes.items():
-            if not 0.0 < value < np.inf:
-                raise ParameterError(f'{name} must be positive and finite, got {value!r} m')
-        self._needle, self._steering, _ = find_needle(needle)
-        reach = self._needle.length - self._steering.free_length
-        if depth > reach:
-            raise ParameterError(f'depth must be <= {reach:g} m with this needle, got {depth!r} m')
-        self._depths = step_depths(depth, step_length)
-        self._limit, self._aside, self._prior = guide_limit, aside, prior
-        self.action_space = spaces.Box(-1.0, 1.0, (2,))
-        self.observation_space = spaces.Box(-BOUND, BOUND, (7,))
-        self._plant: SteeringPlant | None = None
+        needles = _Needles(needle, depth, step_length, guide_limit, aside, prior, 1)
+        super().__init__(needles, render_mode)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
-        """Start an episode; options: ``truth``, a `GroundTruth`, and ``target``, x and z [m]."""
-        super().reset(seed=seed, options=options)
-        rng, given = self.np_random, options or {}
-        path_seed = int(rng.integers(_SEEDS))
-        truth = sample_truth(self._needle, self._steering, self._prior, rng, path_seed)
-        target = rng.uniform(-self._aside, self._aside, 2)
-        self._plant = given.get('truth', truth).plant(self._depths)
-        self._target = np.array(given.get('target', target))
-        return self._observe(self._plant), {'tip': self._plant.tip}
 
-    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        """Move the guide, then the needle; the action is clipped to [-1, 1]."""
-        plant = self._plant
-        if plant is None or plant.done:
-            raise gymnasium.error.ResetNeeded('the episode is over, or none has begun: call reset')
-        x, z = (self._limit * checked_actions(action, (2,))).tolist()
-        plant.guide(GuideSetpoint(x, z))
-        plant.insert()
-        observation, tip = self._observe(plant), plant.tip
-        if not plant.done:
-            return observation, 0.0, False, False, {'tip': tip}
-        miss = float(np.hypot(*(tip - self._target)))
-        return observation, -1e3 * miss, True, False, {'tip': tip, 'miss': miss}
+class SteeringVectorEnv(NeedleVectorEnv):
+    """Needles as in `SteeringEnv`, each with its own seed."""
 
-    def render(self) -> Any:
-        plant = self._plant
-        if self.render_mode is None or plant is None:
-            return None
-        tip, length = (plant.needle.depth, plant.tip[1]), float(1.1 * self._depths[-1])
-        return picture(length, self._limit, tip, (self._depths[-1], self._target[1]))
+    metadata: ClassVar[dict[str, Any]] = {**NeedleVectorEnv.metadata, **_FPS}
 
-    def _observe(self, plant: SteeringPlant) -> FloatArray:
-        tip = plant.tip + self._prior.noise * self.np_random.standard_normal(2)
-        depth = plant.needle.depth / self._depths[-1]
-        lengths = np.concatenate([tip, self._target, plant.needle.guide]) / self._limit
-        numbers = np.clip(np.concatenate([[depth], lengths]), -BOUND, BOUND)
-        return np.asarray(numbers, dtype=np.float32)
+    def __init__(
+        self,
+        num_envs: int = 1,
+        needle: str = DEFAULT_NEEDLE,
+        *,
+        depth: float = 0.1,
+        step_length: float = SIMULATION_LIMITS.step_length,
+        guide_limit: float = SIMULATION_LIMITS.guide_limit,
+        aside: float = 4e-3,
+        prior: SteeringPrior = PRIOR,
+        render_mode: str | None = None,
+    ) -> None:
+        needles = partial(_Needles, needle, depth, step_length, guide_limit, aside, prior)
+        super().__init__(num_envs, needles, render_mode)

@@ -9,12 +9,23 @@ from typing import Any
 from benchmarks.policies import EXPERT, returns
 import gymnasium
 from gymnasium.utils.env_checker import check_env
-from needle_dynamics import Integrator, NeedleModel, NeedleParameters
+from needle_controller import GuideSetpoint, SIMULATION_LIMITS, SteeringPrior
+from needle_controller.steering.simulation import GroundTruth, step_depths
+from needle_dynamics import (
+    DEFAULT_NEEDLE,
+    find_needle,
+    FloatArray,
+    Integrator,
+    NeedleModel,
+    NeedleParameters,
+)
 from needle_dynamics.errors import InsertionDepthError
+from needle_dynamics.steering.needle import wandering
+from needle_dynamics.steering.parameters import with_lengths
 from needle_ros.errors import ParameterError, ShapeError
 from needle_study.gym.insertion import DRAWN, InsertionEnv, InsertionVectorEnv, SPREAD, TARGETS
 from needle_study.gym.pushed import FORCE, PERIOD, START, STEP
-from needle_study.gym.steering import SteeringEnv
+from needle_study.gym.steering import PRIOR, SteeringEnv, SteeringVectorEnv
 import numpy as np
 import pytest
 
@@ -27,18 +38,25 @@ def test_environments_pass_the_gymnasium_checker(name: str) -> None:
         check_env(environment.unwrapped)
 
 
-def test_vector_equals_single_environments_with_separate_seeds() -> None:
-    """Bitwise equal at each step, also across truncated episodes."""
-    many = InsertionVectorEnv(3, max_episode_steps=20)
-    single = [gymnasium.wrappers.TimeLimit(InsertionEnv(), 20) for _ in range(3)]
+@pytest.mark.parametrize('name', ['NeedleInsertion-v0', 'NeedleSteering-v0'])
+def test_vector_equals_single_environments_with_separate_seeds(name: str) -> None:
+    """Bitwise equal at each step, also across episodes that end or are truncated."""
+    options = {'max_episode_steps': 20} if name == 'NeedleInsertion-v0' else {}
+    many = gymnasium.make_vec(f'needle_study.gym:{name}', 3, **options)
+    single = [gymnasium.make(f'needle_study.gym:{name}', **options) for _ in range(3)]
     observations, infos = many.reset(seed=5)
+
+    def equal(info: dict[str, Any], k: int) -> bool:
+        return all(np.array_equal(value, infos[name][k]) for name, value in info.items())
+
     for k, one in enumerate(single):
         observation, info = one.reset(seed=5 + k)
         assert np.array_equal(observation, observations[k])
-        assert info == {name: infos[name][k] for name in info}
+        assert equal(info, k)
     rng, begins = np.random.default_rng(1), np.zeros(3, dtype=bool)
-    for _ in range(30):
-        actions = rng.uniform(-1.0, 1.0, (3, 1))
+    ends = 0
+    for _ in range(50):
+        actions = rng.uniform(-1.0, 1.0, many.action_space.shape)
         observations, rewards, ended, broken, infos = many.step(actions)
         for k, one in enumerate(single):
             if begins[k]:
@@ -46,12 +64,103 @@ def test_vector_equals_single_environments_with_separate_seeds() -> None:
                 reward, over, late = 0.0, False, False
             else:
                 expected, reward, over, late, info = one.step(actions[k])
-            assert info == {name: infos[name][k] for name in info}
+            assert equal(info, k)
             assert all(infos[f'_{name}'][k] for name in info)
             assert np.array_equal(observations[k], expected)
             assert (rewards[k], ended[k], broken[k]) == (reward, over, late)
         begins = ended | broken
+        ends += begins.sum()
+    assert ends >= 6
     many.close()
+
+
+def sampled_truth(prior: SteeringPrior, seed: int) -> tuple[GroundTruth, FloatArray, FloatArray]:
+    """Return needle, target and normal numbers of the first episode of `SteeringEnv`."""
+    rng, _ = gymnasium.utils.seeding.np_random(seed)
+    nominal, steering, _ = find_needle(DEFAULT_NEEDLE)
+    length, skin, *aside = rng.uniform(-1.0, 1.0, 4).tolist()
+    # 3 causes, 21 measurements, and loads of the path up to the cell after the target depth.
+    normal = rng.standard_normal((3 + 21 + 102, 2))
+    needle, steering = with_lengths(
+        nominal, steering, 1.0 + prior.spread * length, 1.0 + prior.spread * skin
+    )
+    tilt, frame, bevel = (
+        size * row
+        for size, row in zip((prior.tilt, prior.frame, prior.bevel), normal, strict=False)
+    )
+    steering = replace(
+        steering, bevel_load=(float(np.hypot(*bevel)),), path_noise=0.0,
+        path_noise_length=prior.path_noise_length,
+    )  # fmt: skip
+    x, z = tilt.tolist()
+    truth = GroundTruth(
+        needle=needle, steering=steering, tilt=(x, z), bevel=bevel, frame=frame, seed=0
+    )
+    return truth, 4e-3 * np.array(aside), normal[3:]
+
+
+@pytest.mark.parametrize('given', [False, True])
+def test_steering_environment_equals_the_simulated_needle(given: bool) -> None:
+    """Sampled, or given as an option; the path noise of the sampled needle is negligible."""
+    prior = replace(PRIOR, path_noise=1e-300)
+    truth, target, normal = sampled_truth(prior, 4)
+    environment = SteeringEnv(prior=prior)
+    options = {'truth': truth, 'target': target} if given else None
+    seen, info = environment.reset(seed=4, options=options)
+    plant, limit = truth.plant(step_depths(0.1, 5e-3)), SIMULATION_LIMITS.guide_limit
+    rng = np.random.default_rng(1)
+    for k in range(21):
+        tip = plant.tip
+        # Squares and powers of the two libraries differ in their last digit.
+        np.testing.assert_allclose(info['tip'], tip, rtol=1e-12, atol=0.0)
+        assert info['miss'] == pytest.approx(np.hypot(*(tip - target)), rel=1e-12)
+        measured = tip + prior.noise * normal[k]
+        expected = np.concatenate([measured, target, plant.needle.guide]) / limit
+        # Observations have the precision of 32 bits.
+        np.testing.assert_allclose(seen, [k / 20, *expected], rtol=1e-6, atol=1e-9)
+        if plant.done:
+            break
+        action = rng.uniform(-1.0, 1.0, 2)
+        plant.guide(GuideSetpoint(*(limit * action).tolist()))
+        plant.insert()
+        seen, reward, over, _, info = environment.step(action)
+        assert over == plant.done
+        assert reward == (-1e3 * info['miss'] if over else 0.0)
+    with pytest.raises(gymnasium.error.ResetNeeded, match='call reset'):
+        environment.step(np.zeros(2))
+
+
+def test_path_noise_of_the_environment_has_the_density_of_its_prior() -> None:
+    """As `wandering`: the loads of 200 needles have its standard deviation and correlation."""
+    environments = SteeringVectorEnv(200, prior=replace(PRIOR, spread=0.0))
+    environments.reset(seed=1)
+    nominal, steering, _ = find_needle(DEFAULT_NEEDLE)
+    steering = replace(steering, path_noise=PRIOR.path_noise)
+    expected = np.array([wandering(nominal, steering, seed) for seed in range(200)])[:, :102]
+    needles: Any = environments._needles
+    found = needles._needles.wander
+    assert found.shape == expected.shape
+    # 200 needles of 40 correlation lengths in two planes: 1 % of their size.
+    assert found.std() == pytest.approx(expected.std(), rel=0.05)
+    both = [
+        np.corrcoef(one[:, 1:].ravel(), one[:, :-1].ravel())[0, 1] for one in (found, expected)
+    ]
+    assert both[0] == pytest.approx(both[1], abs=0.02)
+
+
+def test_next_episode_has_the_population_again() -> None:
+    """Bitwise, after an episode with a given needle of more layers."""
+    environment, other = SteeringEnv(), SteeringEnv()
+    truth, _, _ = sampled_truth(PRIOR, 4)
+    layers = replace(truth.needle, layer_depths=(0.03,), layer_stiffnesses=(1e4,))
+    environment.reset(options={'truth': replace(truth, needle=layers)})
+    environment.step(np.ones(2))
+    assert np.array_equal(environment.reset(seed=3)[0], other.reset(seed=3)[0])
+    action = np.ones(2)
+    assert np.array_equal(environment.step(action)[0], other.step(action)[0])
+    for target in ((1.0, 2.0, 3.0), (np.nan, 0.0)):
+        with pytest.raises((ParameterError, ShapeError), match='target must be'):
+            environment.reset(options={'target': target})
 
 
 def test_vector_seeds_and_masks() -> None:
@@ -120,6 +229,12 @@ def test_environment_equals_the_integrator() -> None:
         (np.zeros(64), ShapeError, r'actions must have shape \(64, 1\), got \(64,\)'),
         (0.5, ShapeError, r'actions must have shape \(64, 1\), got \(\)'),
         ('in', ShapeError, r"actions must be numbers, got 'in'"),
+        (
+            1j * np.ones((64, 1)),
+            ShapeError,
+            r'actions must be real numbers, got an array of complex128',
+        ),
+        (None, ShapeError, r'actions must have shape \(64, 1\), got \(\)'),
     ],
 )
 def test_invalid_actions_are_rejected(
@@ -175,6 +290,19 @@ def test_vector_environment_has_an_image_of_each_needle() -> None:
     one.reset(seed=6)
     assert np.array_equal(many.render()[2], one.render())
     assert InsertionVectorEnv(3).render() is None
+    with pytest.raises(ParameterError, match=r'render_mode must be one of rgb_array, got .human'):
+        InsertionVectorEnv(3, render_mode='human')
+
+
+def test_spread_of_the_needles_is_an_option() -> None:
+    """Without a spread all needles are alike, and only their targets differ."""
+    environments = InsertionVectorEnv(4, spread=0.0)
+    first, _ = environments.reset(seed=1)
+    after, *_ = environments.step(np.full((4, 1), 0.5))
+    assert len(set(first[:, 0])) == 4
+    assert len(set(after[:, 1])) == 1
+    with pytest.raises(ParameterError, match=r'^spread must be in \[0, 1\], got 1\.5$'):
+        InsertionEnv(spread=1.5)
 
 
 def test_a_good_controller_earns_more_than_every_trivial_policy() -> None:
