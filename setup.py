@@ -154,6 +154,8 @@ setup(
             *DASK,
             *GYM,
         ],
+        # Learned policies of `needle bench learning`.
+        'learning': ['stable-baselines3>=2.9', *GYM],
     },
     entry_points={
         'console_scripts': [

@@ -22,6 +22,7 @@ _TOOLS: Final = {
     'graph': ('rclpy',),
     'slicer': ('rclpy', 'pyigtl'),
     'study': ('pyarrow', 'distributed', 'gymnasium'),
+    'learning': ('gymnasium', 'stable-baselines3', 'torch'),
 }
 
 

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 import sys
 import time
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, conclusion, header, Tick
@@ -38,7 +38,11 @@ MODULES = {
     'slicer': ('slicer',),
     'study': ('study', 'environments', 'policies'),
     'pool': ('pool',),
+    'learning': ('learning',),
 }
+
+#: Extras of a benchmark that needs more than ``bench`` and ``ros``.
+_EXTRAS: Final = {'learning': 'learning'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -105,6 +109,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     pool = add('pool', help='a study whose workers are killed at random times')
     pool.add_argument('--kills', type=int, metavar='N', help='workers that are killed')
+    learning = add('learning', help='laws compared with policies learned by PPO')
+    learning.add_argument(
+        '--quick',
+        dest='plan',
+        action='store_const',
+        const='quick',
+        help='a trial, too short for reliable figures',
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -116,7 +128,8 @@ def run(options: argparse.Namespace) -> int:
         modules = [import_module(f'benchmarks.{module}') for module in MODULES[name]]
     except ModuleNotFoundError as error:
         raise ParameterError(
-            f"needle bench {name} needs {error.name}: pip install -e '.[bench,ros]'"
+            f'needle bench {name} needs {error.name}: pip install -e '
+            f"'.[{_EXTRAS.get(name, 'bench,ros')}]'"
         ) from error
     questions = [partial(module.compare, **given) for module in modules]
     page, missed = ask(name, ' '.join(('needle bench', name, *words)), questions)
