@@ -36,12 +36,12 @@ if TYPE_CHECKING:
 SHIFT: Final = 1e-9
 
 #: Least fraction of an element that is cut before the path may restart within it.
-_PART: Final = 0.5
+PART: Final = 0.5
 
 #: Placeholder for the output ``forces`` of `insert`: guide forces are not computed.
 NO_FORCES: Final = np.empty((0, 0, 2))
 
-_NOTHING: Final = 1e-12  #: length below which a piece of path is ignored [m]
+NOTHING: Final = 1e-12  #: length below which a piece of path is ignored [m]
 
 
 class GuidePose(NamedTuple):
@@ -89,7 +89,7 @@ def move(n: Steered, c: Cut, to: GuidePose) -> None:
         _resume(n, c)
         while True:
             last = c.counts[LAST]
-            end = _next_node(n, c.springs.depths[last])
+            end = next_node(n, c.springs.depths[last])
             depth = min(end, to.depth)
             _set(n, c, before, to, (depth - begun) / far, depth)
             _cut(n, c)
@@ -129,7 +129,7 @@ def _set(n: Steered, c: Cut, a: GuidePose, b: GuidePose, part: float, depth: flo
 
 
 @inlined
-def _next_node(n: Steered, depth: float) -> float:
+def next_node(n: Steered, depth: float) -> float:
     """Return the end of the element that starts at a depth [m]; it stays within its layer."""
     layer = layer_at(n.starts, depth)
     border = n.starts[layer + 1] if layer + 1 < len(n.starts) else inf
@@ -153,13 +153,13 @@ def _resume(n: Steered, c: Cut) -> None:
     """Restart the path at the tip if the tip was shifted since the last cut."""
     s, last = c.springs, c.counts[LAST]
     part = c.pose[DEPTH] - s.depths[last]
-    cut, shift = part if part > _NOTHING else 0.0, 0.0
+    cut, shift = part if part > NOTHING else 0.0, 0.0
     for plane in range(2):
         shift = max(shift, abs(c.tip[plane, 0] - _path_end(s, last, plane, cut)))
     if shift <= SHIFT:
         return
-    if part > _NOTHING:
-        if part < _PART * (_next_node(n, s.depths[last]) - s.depths[last]):
+    if part > NOTHING:
+        if part < PART * (next_node(n, s.depths[last]) - s.depths[last]):
             # A path this short is cut again.
             return
         _keep(c)

@@ -11,6 +11,7 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from needle_dynamics import FloatArray
+from needle_dynamics.arrays import BoolArray
 from needle_dynamics.simulated.trajectory import floats
 from needle_ros.errors import ParameterError, ShapeError
 from needle_ros.settings import check_choice
@@ -74,10 +75,12 @@ class Needles(Protocol):
     action_space: spaces.Box  #: of one needle
     observation_space: spaces.Box
 
-    def begin(self, k: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
-        """Start an episode of needle k, with random numbers and options of `reset`."""
+    def begin(
+        self, which: BoolArray, rngs: Sequence[np.random.Generator], options: Mapping[str, Any]
+    ) -> None:
+        """Start episodes of a mask, with generators of all needles and options of `reset`."""
 
-    def step(self, actions: FloatArray, which: Any) -> tuple[FloatArray, Any]:
+    def step(self, actions: FloatArray, which: BoolArray) -> tuple[FloatArray, Any]:
         """Move the needles of a mask; return rewards and ends of episodes (not 0), shape (n,)."""
 
     def observe(self) -> FloatArray:
@@ -107,7 +110,7 @@ class NeedleEnv(gymnasium.Env[FloatArray, FloatArray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
         super().reset(seed=seed, options=options)
-        self._needles.begin(0, self.np_random, options or {})
+        self._needles.begin(_ONE, [self.np_random], options or {})
         self._running = True
         return self._needles.observe()[0], self._info(np.zeros(1))
 
@@ -155,9 +158,8 @@ class NeedleVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         self._begun, self._over = np.zeros((2, num_envs), dtype=bool)
         self._steps = np.zeros(num_envs, dtype=int)
 
-    def _begin(self, which: Any) -> None:
-        for k in np.flatnonzero(which).tolist():
-            self._needles.begin(k, self._rngs[k], {})
+    def _begin(self, which: BoolArray) -> None:
+        self._needles.begin(which, self._rngs, {})
         self._steps[which] = 0
 
     def _info(self, ends: Any) -> dict[str, Any]:

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gymnasium environment of a needle that is pushed to a depth, single or vectorized."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
 from gymnasium import spaces
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
+from needle_dynamics.arrays import BoolArray
 from needle_dynamics.compiled.boxed import Boxed
 from needle_ros.errors import ParameterError
 from needle_study.gym.environment import NeedleEnv, NeedleVectorEnv, picture
@@ -42,7 +43,13 @@ class _Needles:
         self.action_space = spaces.Box(-1.0, 1.0, (1,))
         self.observation_space = spaces.Box(-BOUND, BOUND, (len(UNITS),))
 
-    def begin(self, k: int, rng: np.random.Generator, _options: Mapping[str, Any]) -> None:
+    def begin(
+        self, which: BoolArray, rngs: Sequence[np.random.Generator], _options: Mapping[str, Any]
+    ) -> None:
+        for k in np.flatnonzero(which).tolist():
+            self._sample(k, rngs[k])
+
+    def _sample(self, k: int, rng: np.random.Generator) -> None:
         factors = 1.0 + self._spread * rng.uniform(-1.0, 1.0, len(DRAWN))
         changed: dict[str, Any] = {
             name: float(factor * getattr(self._nominal, name))
@@ -55,7 +62,7 @@ class _Needles:
         all_of.times[k], all_of.states[k] = 0.0, self._start
         all_of.targets[k], self._forces[k] = rng.uniform(*TARGETS), 0.0
 
-    def step(self, actions: FloatArray, which: Any) -> tuple[FloatArray, Any]:
+    def step(self, actions: FloatArray, which: BoolArray) -> tuple[FloatArray, Any]:
         pushes = actions[:, 0].copy()
         self._forces = np.where(which, FORCE * pushes, 0.0)
         return push(self._boxed, pushes, which)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gymnasium environment of a needle whose guide steers its tip, single or vectorized."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from math import atan2, ceil, exp, inf, sqrt
@@ -18,21 +18,21 @@ from needle_dynamics import (
     NeedleParameters,
     SteeringParameters,
 )
+from needle_dynamics.arrays import BoolArray
 from needle_dynamics.compiled.boxed import Boxed
-from needle_dynamics.compiled.cutting_needle import DEPTH
 from needle_dynamics.steering.needle import empty_cut, steered, wandering
-from needle_dynamics.steering.parameters import longest_element, with_lengths
 from needle_ros.errors import ParameterError
 from needle_study.gym.environment import NeedleEnv, NeedleVectorEnv, picture
 from needle_study.gym.pushed import BOUND
 from needle_study.gym.steered import (
     begin,
     CAUSES,
-    Cuts,
+    DEPTH,
+    LANES,
     observe,
     Population,
+    ROWS,
     sample,
-    Springs,
     steer,
     SteeredNeedles,
 )
@@ -71,26 +71,13 @@ class _Needles:
         self._prior, self._limit, self._aside = prior, guide_limit, aside
         self.action_space = spaces.Box(-1.0, 1.0, (2,))
         self.observation_space = spaces.Box(-BOUND, BOUND, (7,))
-        self._allocate_population()
+        self._allocate(self._needle, self._steering)
 
-    def _allocate_population(self) -> None:
-        # The shortest elements are those in the stiffest tissue.
-        stiffest, _ = with_lengths(self._needle, self._steering, 1.0 - self._prior.spread)
-        element = longest_element(stiffest, self._steering)
-        self._allocate(self._needle, self._steering, element)
-        self._replaced = False
-
-    def _allocate(
-        self, needle: NeedleParameters, steering: SteeringParameters, element: float
-    ) -> None:
-        """Allocate needles whose elements are at least this long [m]."""
+    def _allocate(self, needle: NeedleParameters, steering: SteeringParameters) -> None:
+        """Allocate needles like this one; it is the nominal one of the population."""
         nominal, n, prior = steered(needle, steering), self._number, self._prior
         depth, layers, points = self._depths[-1], len(nominal.starts), len(self._depths)
         cells = ceil(depth / nominal.cell) + 2
-        cut = empty_cut(depth, element, layers)
-        springs, *others = (
-            [np.array([one] * n) for one in part] for part in (cut.springs, cut[1:])
-        )
         self._needles = SteeredNeedles(
             population=Population(
                 nominal=nominal._replace(element=min(steering.element, nominal.cell)),
@@ -109,27 +96,33 @@ class _Needles:
             constants=np.zeros((n, 6)),
             layers=np.zeros((n, 3, layers)),
             wander=np.zeros((n, cells, 2)),
-            cuts=Cuts(Springs(*springs), *others[0]),
+            lanes=np.zeros((ceil(n / LANES), ROWS * LANES)),
+            scratch=empty_cut(0.0, 1.0, 0),
             frame=np.zeros((n, 2)),
             noise=np.zeros((n, points, 2)),
             targets=np.zeros((n, 2)),
             steps=np.zeros(n, dtype=np.int64),
         )
-        self._boxed, self._rows = Boxed(self._needles), CAUSES + points + cells
+        self._boxed = Boxed(self._needles)
+        self._uniform, self._normal = np.zeros((n, 4)), np.zeros((n, CAUSES + points + cells, 2))
+        self._replaced = needle is not self._needle
 
-    def begin(self, k: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+    def begin(
+        self, which: BoolArray, rngs: Sequence[np.random.Generator], options: Mapping[str, Any]
+    ) -> None:
         truth = options.get('truth')
         if truth is not None:
-            element = longest_element(truth.needle, truth.steering)
-            self._allocate(truth.needle, truth.steering, element)
-            self._replaced = True
+            self._allocate(truth.needle, truth.steering)
         elif self._replaced:
-            self._allocate_population()
-        sample(self._boxed, k, rng.uniform(-1.0, 1.0, 4), rng.standard_normal((self._rows, 2)))
+            self._allocate(self._needle, self._steering)
+        for k in np.flatnonzero(which).tolist():
+            rngs[k].random(out=self._uniform[k])
+            rngs[k].standard_normal(out=self._normal[k])
+        sample(self._boxed, which, self._uniform, self._normal)
         if truth is not None:
-            self._place(k, truth)
+            self._place(0, truth)
         if 'target' in options:
-            self._needles.targets[k] = checked_target(options['target'])
+            self._needles.targets[:] = checked_target(options['target'])
 
     def _place(self, k: int, truth: GroundTruth) -> None:
         """Replace needle k, and place it on the skin."""
@@ -142,7 +135,7 @@ class _Needles:
         n.frame[k] = truth.frame
         begin(self._boxed, k, np.array(truth.tilt), atan2(*truth.bevel))
 
-    def step(self, actions: FloatArray, which: Any) -> tuple[FloatArray, Any]:
+    def step(self, actions: FloatArray, which: BoolArray) -> tuple[FloatArray, Any]:
         return steer(self._boxed, actions, which)
 
     def observe(self) -> FloatArray:
@@ -153,7 +146,8 @@ class _Needles:
         return {'tip': self._tips[:, :2], 'miss': self._tips[:, 2]}
 
     def picture(self, k: int) -> Any:
-        depth, deepest = self._needles.cuts.pose[k, DEPTH], float(self._depths[-1])
+        group, lane = divmod(k, LANES)
+        depth, deepest = self._needles.lanes[group, DEPTH + lane], float(self._depths[-1])
         target = deepest, self._needles.targets[k, 1]
         return picture(1.1 * deepest, self._limit, (depth, self._tips[k, 1]), target)
 
