@@ -21,7 +21,8 @@ _TOOLS: Final = {
     'identification': ('mcap', 'rosbags', 'mcap-ros2-support'),
     'graph': ('rclpy',),
     'slicer': ('rclpy', 'pyigtl'),
-    'study': ('pyarrow', 'distributed', 'gymnasium'),
+    'study': ('pyarrow', 'distributed'),
+    'environments': ('gymnasium',),
     'learning': ('gymnasium', 'stable-baselines3', 'torch'),
 }
 

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Final
 
+from benchmarks.episodes import Policy, ready, total_rewards
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray, NeedleParameters
+from needle_dynamics.arrays import BoolArray
 from needle_study.gym.insertion import InsertionVectorEnv
 from needle_study.gym.pushed import EFFORT, FORCE, NEAR, PERIOD, START, TIME, UNITS, WAY
 import numpy as np
@@ -22,10 +23,8 @@ GAINS: Final = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 
 _NEEDLES: Final = {'default': 1000, 'full': 1000, 'quick': 20}
 
-Policy = Callable[[FloatArray], FloatArray]
 
-
-def expert(observations: FloatArray) -> FloatArray:
+def expert(observations: FloatArray, _running: BoolArray) -> FloatArray:
     """
     Return actions from the nominal friction, shape (n, 1).
 
@@ -49,10 +48,10 @@ def policies(number: int) -> dict[str, Policy]:
     """Return the policies by name, for a number of needles."""
     rng = np.random.default_rng(1)
 
-    def constant(action: float, _: FloatArray) -> FloatArray:
+    def constant(action: float, _: FloatArray, _running: BoolArray) -> FloatArray:
         return np.full((number, 1), action)
 
-    def proportional(gain: float, observations: FloatArray) -> FloatArray:
+    def proportional(gain: float, observations: FloatArray, _running: BoolArray) -> FloatArray:
         return np.asarray(np.clip(gain * observations[:, :1], -1.0, 1.0))
 
     return {
@@ -60,24 +59,17 @@ def policies(number: int) -> dict[str, Policy]:
         'stay': partial(constant, 0.0),
         'leave': partial(constant, -1.0),
         'push': partial(constant, 1.0),
-        'random': lambda _: rng.uniform(-1.0, 1.0, (number, 1)),
+        'random': lambda _, _running: rng.uniform(-1.0, 1.0, (number, 1)),
         **{f'gain {gain:g}': partial(proportional, gain) for gain in GAINS},
     }
 
 
 def returns(number: int) -> dict[str, FloatArray]:
     """Return the sum of rewards of an episode for each seed from 0 and each policy, by name."""
-    found = {}
-    for name, policy in policies(number).items():
-        environments = InsertionVectorEnv(number)
-        observations, _ = environments.reset(seed=0)
-        totals, running = np.zeros(number), np.ones(number, dtype=bool)
-        while running.any():
-            observations, rewards, over, late, _ = environments.step(policy(observations))
-            totals += np.where(running, rewards, 0.0)
-            running &= ~(over | late)
-        found[name] = totals
-    return found
+    return {
+        name: total_rewards(InsertionVectorEnv(number), partial(ready, policy))
+        for name, policy in policies(number).items()
+    }
 
 
 def compare(tick: Tick, plan: str = 'default') -> Answer:

@@ -36,7 +36,8 @@ MODULES = {
     'commissioning': ('commissioning',),
     'graph': ('graph',),
     'slicer': ('slicer',),
-    'study': ('study', 'environments', 'policies'),
+    'study': ('study',),
+    'environments': ('environments', 'policies'),
     'pool': ('pool',),
     'learning': ('learning',),
 }
@@ -109,14 +110,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     pool = add('pool', help='a study whose workers are killed at random times')
     pool.add_argument('--kills', type=int, metavar='N', help='workers that are killed')
-    learning = add('learning', help='laws compared with policies learned by PPO')
-    learning.add_argument(
-        '--quick',
-        dest='plan',
-        action='store_const',
-        const='quick',
-        help='a trial, too short for reliable figures',
-    )
+    for name, about in (
+        ('environments', 'speed of the Gymnasium environments, and policies without a model'),
+        ('learning', 'laws compared with policies learned by PPO'),
+    ):
+        add(name, help=about).add_argument(
+            '--quick',
+            dest='plan',
+            action='store_const',
+            const='quick',
+            help='a trial, too short for reliable figures',
+        )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -3,14 +3,19 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
 from benchmarks import environments, run
 from benchmarks import study as bench_study
+from benchmarks.episodes import Inserting, Steering, total_rewards
 from benchmarks.kills import again, written
 from benchmarks.study import StudyPlan
+from needle_controller import LAWS
 from needle_insertion.cli import main
+from needle_study.gym.insertion import InsertionVectorEnv
+from needle_study.gym.steering import SteeringVectorEnv
 import pytest
 import yaml
 
@@ -76,11 +81,22 @@ def test_repeated_computation_is_counted(tmp_path: Path) -> None:
 
 def test_every_environment_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(environments, 'STEPS', {'single': 30, 'vector': 3})
-    [section], bars = environments.compare(lambda _stage: None, 'quick')
-    assert bars == []
+    [section], [bar] = environments.compare(lambda _stage: None, 'quick')
+    assert bar.figure == '64 steered needles over one'
+    assert bar.limit == 10.0
     names = ['NeedleInsertion-v0', 'NeedleSteering-v0', 'CartPole-v1', 'Pendulum-v1']
     assert [row[0] for row in section.rows] == names
     assert all(float(rate) > 0.0 for row in section.rows for rate in row[1:])
+
+
+def test_laws_of_the_suite_reach_targets_of_the_environments() -> None:
+    """From observations alone; a fixed guide does not."""
+    for name in LAWS:
+        assert total_rewards(InsertionVectorEnv(4), partial(Inserting, name)).min() > 1.0
+    # The negative distance [mm].
+    for name in ('multi_hypothesis', 'springs'):
+        assert total_rewards(SteeringVectorEnv(4), partial(Steering, name)).min() > -1.0
+    assert total_rewards(SteeringVectorEnv(4), partial(Steering, 'open_loop')).max() < -1.0
 
 
 def test_missing_package_is_named(
@@ -92,7 +108,10 @@ def test_missing_package_is_named(
         raise ModuleNotFoundError("No module named 'pyarrow'", name='pyarrow')
 
     monkeypatch.setattr(run, 'import_module', missing)
-    assert main(['bench', 'study', '--quick']) == 2
-    said = capsys.readouterr()
-    assert said.err == "error: needle bench study needs pyarrow: pip install -e '.[bench,ros]'\n"
-    assert said.out == ''
+    for name, extra in (('study', 'bench,ros'), ('learning', 'learning')):
+        assert main(['bench', name, '--quick']) == 2
+        said = capsys.readouterr()
+        assert (
+            said.err == f"error: needle bench {name} needs pyarrow: pip install -e '.[{extra}]'\n"
+        )
+        assert said.out == ''
