@@ -39,7 +39,7 @@ def ready(policy: Policy, _first: FloatArray) -> Policy:
     return policy
 
 
-class Inserting:
+class InsertionPolicy:
     """A control law for each needle, with the nominal needle as its model."""
 
     def __init__(self, law: str, first: FloatArray) -> None:
@@ -63,7 +63,7 @@ class Inserting:
         return np.clip(actions, -1.0, 1.0)
 
 
-class Steering:
+class SteeringPolicy:
     """A steering law for each needle; the guide rests after a fault of the law."""
 
     def __init__(self, law: str, first: FloatArray) -> None:

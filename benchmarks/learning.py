@@ -8,7 +8,14 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from benchmarks.episodes import Inserting, Maker, Policy, ready, Steering, total_rewards
+from benchmarks.episodes import (
+    InsertionPolicy,
+    Maker,
+    Policy,
+    ready,
+    SteeringPolicy,
+    total_rewards,
+)
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
 from benchmarks.policies import EXPERT, expert
@@ -228,12 +235,15 @@ def compare(tick: Tick, plan: str = 'default') -> Answer:
     cases: tuple[tuple[str, str, Environments, dict[str, Maker], int], ...] = (
         (
             'NeedleInsertion-v0', '', inserted,
-            {**{law: partial(Inserting, law) for law in LAWS}, EXPERT: partial(ready, expert)},
+            {
+                **{law: partial(InsertionPolicy, law) for law in LAWS},
+                EXPERT: partial(ready, expert),
+            },
             size.insertions,
         ),
         (
             'NeedleSteering-v0', 'mm', steered,
-            {law: partial(Steering, law) for law in STEERED},
+            {law: partial(SteeringPolicy, law) for law in STEERED},
             size.steerings,
         ),
     )  # fmt: skip

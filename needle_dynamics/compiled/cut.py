@@ -89,7 +89,7 @@ def move(n: Steered, c: Cut, to: GuidePose) -> None:
         _resume(n, c)
         while True:
             last = c.counts[LAST]
-            end = next_node(n, c.springs.depths[last])
+            end = node_after(n, c.springs.depths[last])
             depth = min(end, to.depth)
             _set(n, c, before, to, (depth - begun) / far, depth)
             _cut(n, c)
@@ -129,7 +129,7 @@ def _set(n: Steered, c: Cut, a: GuidePose, b: GuidePose, part: float, depth: flo
 
 
 @inlined
-def next_node(n: Steered, depth: float) -> float:
+def node_after(n: Steered, depth: float) -> float:
     """Return the end of the element that starts at a depth [m]; it stays within its layer."""
     layer = layer_at(n.starts, depth)
     border = n.starts[layer + 1] if layer + 1 < len(n.starts) else inf
@@ -159,7 +159,7 @@ def _resume(n: Steered, c: Cut) -> None:
     if shift <= SHIFT:
         return
     if part > NOTHING:
-        if part < PART * (next_node(n, s.depths[last]) - s.depths[last]):
+        if part < PART * (node_after(n, s.depths[last]) - s.depths[last]):
             # A path this short is cut again.
             return
         _keep(c)

@@ -97,7 +97,7 @@ class InsertionEnv(NeedleEnv):
     """
 
     def __init__(
-        self, needle: str = 'phantom', spread: float = SPREAD, render_mode: str | None = None
+        self, needle: str = 'phantom', render_mode: str | None = None, *, spread: float = SPREAD
     ) -> None:
         super().__init__(_Needles(needle, spread, 1), render_mode)
 
@@ -109,9 +109,10 @@ class InsertionVectorEnv(NeedleVectorEnv):
         self,
         num_envs: int = 1,
         needle: str = 'phantom',
-        spread: float = SPREAD,
         max_episode_steps: int = 500,
         render_mode: str | None = None,
+        *,
+        spread: float = SPREAD,
     ) -> None:
         needles = partial(_Needles, needle, spread)
         super().__init__(num_envs, needles, render_mode, max_episode_steps)

@@ -12,7 +12,7 @@ from needle_dynamics.compiled.cache import compiled, inlined, kernel
 from needle_dynamics.compiled.cut import (
     correlate,
     GuidePose,
-    next_node,
+    node_after,
     NOTHING,
     PART,
     SHIFT,
@@ -309,7 +309,7 @@ def _resume(n: Steered, w: FloatArray, i: int) -> None:
     if shift <= SHIFT:
         return
     if part > NOTHING:
-        if part < PART * (next_node(n, node) - node):
+        if part < PART * (node_after(n, node) - node):
             return
         w[_BEFORE + i], w[_NODE + i] = node, w[DEPTH + i]
         for row in range(_C, _C + _TIP, LANES):
@@ -330,7 +330,7 @@ def _aim(a: SteeredNeedles, w: FloatArray, first: int, count: int) -> bool:
         w[_LENGTH + i] = w[_KEEPS + i] = 0.0
         if w[DEPTH + i] < w[_TO + i]:
             n, node = _needle(a, first + i), w[_NODE + i]
-            layer, end = layer_at(n.starts, node), next_node(n, node)
+            layer, end = layer_at(n.starts, node), node_after(n, node)
             depth = min(end, w[_TO + i])
             _set_load(n, w, i, layer, depth)
             w[DEPTH + i], w[_LENGTH + i], w[_TISSUE + i] = depth, depth - node, n.stiffness[layer]

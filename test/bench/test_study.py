@@ -9,7 +9,7 @@ from types import ModuleType
 
 from benchmarks import environments, run
 from benchmarks import study as bench_study
-from benchmarks.episodes import Inserting, Steering, total_rewards
+from benchmarks.episodes import InsertionPolicy, SteeringPolicy, total_rewards
 from benchmarks.kills import again, written
 from benchmarks.study import StudyPlan
 from needle_controller import LAWS
@@ -92,11 +92,12 @@ def test_every_environment_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_laws_of_the_suite_reach_targets_of_the_environments() -> None:
     """From observations alone; a fixed guide does not."""
     for name in LAWS:
-        assert total_rewards(InsertionVectorEnv(4), partial(Inserting, name)).min() > 1.0
+        # All needles arrive: progress and arrival are 2, less time and force.
+        assert total_rewards(InsertionVectorEnv(4), partial(InsertionPolicy, name)).min() > 0.5
     # The negative distance [mm].
     for name in ('multi_hypothesis', 'springs'):
-        assert total_rewards(SteeringVectorEnv(4), partial(Steering, name)).min() > -1.0
-    assert total_rewards(SteeringVectorEnv(4), partial(Steering, 'open_loop')).max() < -1.0
+        assert total_rewards(SteeringVectorEnv(4), partial(SteeringPolicy, name)).min() > -2.0
+    assert total_rewards(SteeringVectorEnv(4), partial(SteeringPolicy, 'open_loop')).max() < -2.0
 
 
 def test_missing_package_is_named(
