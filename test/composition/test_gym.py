@@ -77,6 +77,23 @@ def test_vector_equals_single_environments_with_separate_seeds(name: str) -> Non
     many.close()
 
 
+def test_needles_in_other_lanes_do_not_matter() -> None:
+    """Bitwise equal, although some needles began later and restart at other steps."""
+    many, other = SteeringVectorEnv(5), SteeringVectorEnv(5)
+    for one in (many, other):
+        one.reset(seed=1)
+    rng, late = np.random.default_rng(2), np.array([True, False, True, False, False])
+    for k in range(45):
+        if k == 3:
+            many.reset(options={'reset_mask': late})
+        actions = rng.uniform(-1.0, 1.0, (5, 2))
+        found, rewards, *_ = many.step(actions)
+        expected, others, *_ = other.step(actions)
+        assert np.array_equal(found[~late], expected[~late])
+        assert np.array_equal(rewards[~late], others[~late])
+        assert k < 3 or (found[late, 0] != expected[late, 0]).all()
+
+
 def sampled_truth(prior: SteeringPrior, seed: int) -> tuple[GroundTruth, FloatArray, FloatArray]:
     """Return needle, target and normal numbers of the first episode of `SteeringEnv`."""
     rng, _ = gymnasium.utils.seeding.np_random(seed)
