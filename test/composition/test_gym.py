@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
+from benchmarks.episodes import Maker, Policy, ready, SteeringPolicy, total_rewards
 from benchmarks.policies import EXPERT, returns
 import gymnasium
 from gymnasium.utils.env_checker import check_env
@@ -344,6 +346,32 @@ def test_a_good_controller_earns_more_than_every_trivial_policy() -> None:
         assert (best > values).all(), name
     # All needles arrive: progress and arrival are 2, less time and force.
     assert best.min() > 0.5
+
+
+def test_steering_law_misses_by_a_tenth_of_every_trivial_policy() -> None:
+    """Mean of 100 needles; on a single needle a trivial policy may hit by accident."""
+    number, rng = 100, np.random.default_rng(1)
+
+    def corrected(gain: float, kept: float, seen: FloatArray, _running: Any) -> FloatArray:
+        return kept * seen[:, 5:] + gain * (seen[:, 3:5] - seen[:, 1:3])
+
+    trivial: dict[str, Policy] = {
+        'stay': lambda _seen, _running: np.zeros((number, 2)),
+        'limit': lambda _seen, _running: np.ones((number, 2)),
+        'random': lambda _seen, _running: rng.uniform(-1.0, 1.0, (number, 2)),
+        'target': lambda seen, _running: seen[:, 3:5],
+    }
+    for gain in (-1.0, -0.3, -0.1, 0.1, 0.3, 1.0):
+        trivial[f'P {gain}'] = partial(corrected, gain, 0.0)
+        trivial[f'I {gain}'] = partial(corrected, gain, 1.0)
+
+    def mean(make: Maker) -> float:
+        return float(total_rewards(SteeringVectorEnv(number), make).mean())
+
+    ours = mean(partial(SteeringPolicy, 'multi_hypothesis'))
+    assert ours > -0.2
+    for name, policy in trivial.items():
+        assert mean(partial(ready, policy)) < 10.0 * ours, name
 
 
 def test_moving_guide_reduces_the_mean_miss() -> None:
