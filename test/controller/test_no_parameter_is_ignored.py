@@ -80,7 +80,7 @@ def test_settings_classes_of_all_packages_are_found() -> None:
     packages = {one.__module__.partition('.')[0] for one in SETTINGS}
     assert packages == {
         f'needle_{name}'
-        for name in ('controller', 'dynamics', 'identification', 'insertion', 'study')
+        for name in ('controller', 'dynamics', 'identification', 'insertion', 'planning', 'study')
     }
 
 
