@@ -30,6 +30,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     'experiment': 'record an experiment on the simulated robot',
     'reproduce': "compute the paper's results and compare them with the paper",
     'simulate': 'simulate the needle in open loop, without ROS',
+    'plan': 'find an entry point and a needle path in a segmented image',
     'steer': 'steer a simulated needle to a target, without ROS',
     'study': 'estimate the hit probability in a population of insertions',
     'analyze': 'controllability and observability',

@@ -27,6 +27,7 @@ MODULES: Final = (
     'needle_dynamics.compiled.cut',
     'needle_dynamics.compiled.cutting_needle',
     'needle_dynamics.compiled.superposition',
+    'needle_planning.compiled.boxes',
     'needle_controller.compiled.laws',
     'needle_controller.compiled.quintic',
     'needle_dynamics.compiled.axis',

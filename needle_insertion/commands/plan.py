@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`needle plan`: entry point and needle path with the largest clearance in a segmented image."""
+
+import argparse
+from math import isfinite
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from needle_controller.steering.settings import SteeringLimits
+from needle_dynamics.needles import DEFAULT_NEEDLE
+from needle_insertion.commands import common
+from needle_insertion.progress import ProgressLine
+from needle_insertion.report.content import table
+from needle_planning.plan import find_plan, Plan, write_plan
+from needle_ros.errors import ParameterError
+from needle_ros.quantities import quantities
+import numpy as np
+
+#: Options whose value may begin with a minus sign.
+SIGNED = ('--target', '--entry')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        'Find the entry point from which a needle reaches a target with the largest clearance, '
+        'straight or bowed by the guide, and prove that no other one is better by more than a '
+        'resolution. Positions are in patient coordinates, RAS.'
+    )
+    parser.add_argument(
+        'segmentation',
+        type=Path,
+        nargs='+',
+        metavar='SEGMENTATION',
+        help='segmented image or surfaces (.nrrd, .nii, .nii.gz, .stl), several for one patient',
+    )
+    parser.add_argument(
+        '--labels',
+        type=Path,
+        required=True,
+        metavar='LABELS.yaml',
+        help='role of each label: obstacle with a margin, tissue, target or entry',
+    )
+    parser.add_argument(
+        '--target',
+        required=True,
+        metavar='R,A,S',
+        help='target of the tip, such as 40mm,-12mm,105mm; m without a unit',
+    )
+    parser.add_argument(
+        '--entry',
+        metavar='REGION',
+        help='name of the structure where the needle may enter, or an entry point R,A,S (default: '
+        'all structures with the role entry)',
+    )
+    common.add_quantity(
+        parser,
+        '--entry-radius',
+        'm',
+        'radius of the disc of entry points around an entry point (default 10mm)',
+        0.01,
+    )
+    common.add_needle(parser, DEFAULT_NEEDLE)
+    limits = SteeringLimits()
+    for name, unit, meaning, value in (
+        ('--step', 'm', 'longest step of the insertion (default 5mm)', limits.step_length),
+        ('--limit', 'm', 'largest displacement of the guide along x and z (default 6mm)',
+         limits.guide_limit),
+        ('--guide-step', 'm', 'largest motion of the guide in a step (default 2mm)',
+         limits.guide_step),
+        ('--load-limit', 'N', 'largest lateral force on the guide (default 8N)',
+         limits.load_limit),
+        ('--roll', 'rad', 'roll of the needle (default 0)', 0.0),
+        ('--resolution', 'm', 'resolution of the search (default 0.5mm)', 5e-4),
+    ):  # fmt: skip
+        common.add_quantity(parser, name, unit, meaning, value)
+    common.add_flag(parser, '--straight', 'plan a straight needle only')
+    parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='plan to write (.yaml)')
+    common.add_flag(parser, '--json', 'print JSON instead of a table')
+
+
+def run(options: argparse.Namespace) -> int:
+    common.check_file(options.output)
+    target = _position('--target', options.target)
+    limits = SteeringLimits(
+        step_length=options.step,
+        guide_limit=options.limit,
+        guide_step=options.guide_step,
+        load_limit=options.load_limit,
+    )
+    begin = perf_counter()
+    with ProgressLine('plan', brief=True) as show:
+        show('reading the segmentation')
+        # Imported here: readers of images are optional.
+        from needle_planning.labels import read_anatomy
+
+        anatomies = read_anatomy(options.segmentation, options.labels)
+        plan = find_plan(
+            anatomies,
+            target,
+            entry=_entry(options.entry),
+            entry_radius=options.entry_radius,
+            needle=options.needle,
+            limits=limits,
+            roll=options.roll,
+            bow=not options.straight,
+            resolution=options.resolution,
+            progress=show,
+        )
+    seconds = perf_counter() - begin
+    files = []
+    if options.output is not None:
+        write_plan(plan, options.output)
+        files.append(options.output)
+    common.print_result(
+        document_of(plan, seconds), text_of(plan, seconds), files, as_json=options.json
+    )
+    return 0
+
+
+def _position(name: str, text: str) -> list[float]:
+    found = quantities(text, 'm')
+    if len(found) != 3 or not all(map(isfinite, found)):
+        raise ParameterError(f'{name} must be R,A,S, such as 40mm,-12mm,105mm, got {text!r}')
+    return found
+
+
+def _entry(text: str | None) -> str | list[float] | None:
+    """Return the name of a structure, or an entry point [m]."""
+    return text if text is None or ',' not in text else _position('--entry', text)
+
+
+def document_of(plan: Plan, seconds: float) -> dict[str, Any]:
+    """Return the results for `--json`, in SI units."""
+    return {
+        'entry [m]': plan.entry.tolist(),
+        'direction': plan.direction.tolist(),
+        'target [m]': plan.target.tolist(),
+        'length [m]': plan.length,
+        'clearance [m]': plan.clearance,
+        'structure': plan.structure,
+        'place [m]': plan.place.tolist(),
+        'bow [m]': plan.bow,
+        'largest straight clearance [m]': plan.straight_bound,
+        'largest clearance [m]': plan.bound,
+        'resolution [m]': plan.resolution,
+        'time [s]': seconds,
+    }
+
+
+def text_of(plan: Plan, seconds: float) -> str:
+    """Return the results as text and a table, lengths in mm."""
+    rows = [
+        (name, *(f'{factor * one:.{digits}f}' for one in at))
+        for name, at, factor, digits in (
+            ('entry', plan.entry, 1e3, 2),
+            ('target', plan.target, 1e3, 2),
+            ('least clearance', plan.place, 1e3, 2),
+            ('direction', plan.direction, 1.0, 4),
+        )
+    ]
+    kind = f'bowed by up to {1e3 * plan.bow:.2f} mm' if plan.guide.any() else 'straight'
+    near = f'to {plan.structure}' if plan.structure else 'to all obstacles'
+    travel = 1e3 * np.abs(plan.guide).max(initial=0.0)
+    return (
+        f'path found in {seconds:.1f} s: {plan.needle}, {len(plan.guide)} steps to '
+        f'{1e3 * plan.length:.1f} mm, {kind}, guide within {travel:.2f} mm\n'
+        f'clearance {1e3 * plan.clearance:.2f} mm {near}, beyond its margin; no straight needle '
+        f'has more than {1e3 * plan.straight_bound:.2f} mm,\n'
+        f'no needle within the limits of the guide more than {1e3 * plan.bound:.2f} mm\n\n'
+        f'{table(rows, ("", "R [mm]", "A [mm]", "S [mm]"))}'
+    )
