@@ -183,12 +183,19 @@ class _Grid:
         low = np.ceil((self._low - away) / frame.spacing - 0.5).clip(0, shape).astype(int)
         high = np.floor((self._high + away) / frame.spacing + 1.5).clip(low, shape).astype(int)
         part = anatomy.labels[tuple(map(slice, low, high))]
-        first, last, kinds = _boxes(part, [label for label, _ in self._obstacles])
-        tree, order = _tree(
-            (first + low - 0.5) * frame.spacing, (last + low + 0.5) * frame.spacing, margins[kinds]
-        )
+        labels = [label for label, _ in self._obstacles]
+        first, last, kinds = _boxes(part, labels)
+        region = np.stack([low - 0.5, low + part.shape - 0.5]) * frame.spacing
+
+        def tree(first: IntArray, last: IntArray, margins: FloatArray) -> tuple[BoxTree, IntArray]:
+            ends = (first + low - 0.5) * frame.spacing, (last + low + 0.5) * frame.spacing
+            return _tree(*ends, margins, region)
+
+        self._tree, order = tree(first, last, margins[kinds])
         self._kinds = np.append(kinds, -1)[order]
-        self._tree, self._boxed = tree, Boxed(tree)
+        first, last, kinds = _boxes(part, labels, others=True)
+        gaps, _ = tree(first, last, np.zeros(len(kinds)))
+        self._boxed, self._gaps = Boxed(self._tree), Boxed(gaps)
 
     def points(self, points: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
         """Return clearance and nearest box, and points of the frame, of points (k, 3)."""
@@ -225,24 +232,26 @@ class _Grid:
         """Return the output of `line_clearances`, shape (m, 3)."""
         starts = np.ascontiguousarray(self.frame.of_patient(entries))
         end, found = self.frame.of_patient(target), np.empty((len(starts), 3))
-        line_clearances(self._boxed, starts, end, radii, bow, tolerance, enough, found)
+        line_clearances(self._boxed, self._gaps, starts, end, radii, bow, tolerance, enough, found)
         return found
 
 
-def _boxes(labels: NDArray[np.integer], wanted: list[int]) -> tuple[IntArray, IntArray, IntArray]:
+def _boxes(
+    labels: NDArray[np.integer], wanted: list[int], *, others: bool = False
+) -> tuple[IntArray, IntArray, IntArray]:
     """Return first and last voxel (n, 3) of boxes that cover labels, and numbers of these (n,)."""
     # Boxes are runs of voxels along the axis that is contiguous in memory.
     order = np.argsort(labels.strides, kind='stable')[::-1]
-    found = [np.empty((0, 5), dtype=np.int64), *_runs(labels.transpose(order), wanted)]
+    found = [np.empty((0, 5), dtype=np.int64), *_runs(labels.transpose(order), wanted, others)]
     i, j, begin, end, kind = np.concatenate(found).T
     first, last = np.empty((2, len(i), 3), dtype=np.int64)
     first[:, order], last[:, order] = np.stack([i, j, begin], 1), np.stack([i, j, end], 1)
     return first, last, kind
 
 
-def _runs(labels: NDArray[np.integer], wanted: list[int]) -> Iterator[IntArray]:
+def _runs(labels: NDArray[np.integer], wanted: list[int], others: bool) -> Iterator[IntArray]:
     """Yield i, j, first k, last k and number of the label of runs along k, shape (n, 5)."""
-    if not labels.size or not wanted:
+    if not labels.size:
         return
     low, high = int(labels.min()), int(labels.max())
     table = np.zeros(high - low + 1, dtype=np.uint16) if high - low < 2**16 else None
@@ -257,6 +266,8 @@ def _runs(labels: NDArray[np.integer], wanted: list[int]) -> Iterator[IntArray]:
         else:
             for number, label in enumerate(wanted, 1):
                 padded[:, 1:-1][slab == label] = number
+        if others:
+            padded[:, 1:-1] = padded[:, 1:-1] == 0
         if not padded.any():
             continue
         j, change = np.nonzero(padded[:, 1:] != padded[:, :-1])
@@ -272,7 +283,9 @@ def _runs(labels: NDArray[np.integer], wanted: list[int]) -> Iterator[IntArray]:
         )  # fmt: skip
 
 
-def _tree(low: FloatArray, high: FloatArray, margins: FloatArray) -> tuple[BoxTree, IntArray]:
+def _tree(
+    low: FloatArray, high: FloatArray, margins: FloatArray, region: FloatArray
+) -> tuple[BoxTree, IntArray]:
     """Return the tree of boxes, and the number of the box in each place, -1 without one."""
     leaves = 2 ** max(0, ceil(log2(max(1.0, len(low) / LEAF))))
     order = np.full(leaves * LEAF, -1)
@@ -297,6 +310,7 @@ def _tree(low: FloatArray, high: FloatArray, margins: FloatArray) -> tuple[BoxTr
         bounds[1, half:count] = bounds[1, count : 2 * count].reshape(half, 2, 3).max(axis=1)
         most[half:count] = most[count : 2 * count].reshape(half, 2).max(axis=1)
         count = half
+    bounds[:, 0] = region
     tree = BoxTree(corners[0], corners[1], margin, bounds[0], bounds[1], most, _CAP)
     return tree, order
 

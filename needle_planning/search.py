@@ -25,6 +25,7 @@ from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_dynamics.simulated.batch import thread_count
 from needle_planning.anatomy import Anatomy
 from needle_planning.clearance import Clearance, image_frame, ImageFrame, LineClearance, NO_BOW
+from needle_planning.paths import guide_axes
 from needle_ros.errors import ParameterError
 import numpy as np
 
@@ -81,8 +82,6 @@ def voxel_region(anatomy: Anatomy, labels: list[int], target: FloatArray) -> Ent
 
 def disc_region(point: FloatArray, radius: float, target: FloatArray) -> EntryRegion:
     """Return squares of about 1 mm on a disc around a point, perpendicular to the line to it."""
-    from needle_planning.paths import guide_axes
-
     axes = guide_axes(target - point)
     count = int(np.ceil(radius / _SQUARE))
     size = radius / (count + 0.5) if count else 0.0

@@ -22,8 +22,8 @@ class BoxTree(NamedTuple):
     """
     Boxes in a complete binary tree: node 1 is the root, node i has the children 2 i and 2 i + 1.
 
-    The leaves are the second half of the nodes. Leaf i has the `LEAF` boxes from `LEAF` i on. A
-    box that only fills its leaf has the margin -inf.
+    Node 0 is the region of the tree. The leaves are the second half of the nodes. Leaf i has the
+    `LEAF` boxes from `LEAF` i on. A box that only fills its leaf has the margin -inf.
     """
 
     low: Matrix  #: lower corner of each box [m], shape (n, 3)
@@ -91,6 +91,32 @@ def _nearest(
     return least, found
 
 
+@inlined
+def _depth(gaps: BoxTree, x: float, y: float, z: float, stack: IntVector) -> float:
+    """Return the distance from a point to the boxes, or to the border of the region [m]."""
+    depth, _ = _nearest(gaps, x, y, z, -1, stack)
+    low, high = gaps.node_low[0], gaps.node_high[0]
+    depth = min(depth, x - low[0], high[0] - x)
+    return float(min(depth, y - low[1], high[1] - y, z - low[2], high[2] - z))
+
+
+@inlined
+def _between(values: Vector, s: float) -> float:
+    """Return values at equal fractions, interpolated at a fraction."""
+    at = s * (len(values) - 1)
+    k = min(int(at), max(len(values) - 2, 0))
+    return float(values[k] + (at - k) * (values[min(k + 1, len(values) - 1)] - values[k]))
+
+
+@inlined
+def _steepest(values: Vector) -> float:
+    """Return the largest slope of `_between`."""
+    found = 0.0
+    for k in range(1, len(values)):
+        found = max(found, abs(values[k] - values[k - 1]))
+    return found * (len(values) - 1)
+
+
 @kernel
 def point_clearances(
     boxed: Boxed[BoxTree], points: Matrix, clearances: Vector, nearest: IntVector
@@ -105,6 +131,7 @@ def point_clearances(
 @kernel
 def line_clearances(
     boxed: Boxed[BoxTree],
+    free: Boxed[BoxTree],
     entries: Matrix,
     target: Vector,
     radii: Vector,
@@ -114,22 +141,21 @@ def line_clearances(
     found: Matrix,
 ) -> None:
     """Bound the least clearance of lines from entry points to a target, with a gain by a bow."""
+    # ``free`` are the boxes of its region without an obstacle: obstacles fill a ball in the region
+    # that does not reach these boxes.
     # ``entries``, shape (m, 3), and ``target``, shape (3,) [m]; ``bow``, shape (p,): gain at equal
     # fractions of each line, from entry to target [m]; ``radii``, shape (m,): distance of further
     # entry points. Outputs in ``found``, shape (m, 3): least value of clearance and gain at the
     # examined points of the line; upper bound for all entry points within the radius; fraction of
     # the line at the least value. The true least value is within ``tolerance`` of the first. A
     # line ends early, with -inf, when its upper bound is at most ``enough``.
-    t, stack = boxed.value, np.empty(_DEEPEST, np.int64)
+    t, gaps, stack = boxed.value, free.value, np.empty(_DEEPEST, np.int64)
     for i in range(len(entries)):
         x, y, z = entries[i, 0], entries[i, 1], entries[i, 2]
         dx, dy, dz = target[0] - x, target[1] - y, target[2] - z
         length = sqrt(dx * dx + dy * dy + dz * dz)
-        # Change of the gain along the line.
-        steepest = 0.0
-        for k in range(1, len(bow)):
-            steepest = max(steepest, abs(bow[k] - bow[k - 1]))
-        steepest = 1.0 + steepest * (len(bow) - 1) / length
+        # Slope of the clearance and of the gain along the line.
+        steepest = 1.0 + _steepest(bow) / length
         least, upper, place, guess = inf, inf, 1.0, -1
         s, first, ended = 0.0, _FIRST, False
         while True:
@@ -137,11 +163,13 @@ def line_clearances(
             if first >= 0:
                 s = first / _FIRST
             value, guess = _nearest(t, x + s * dx, y + s * dy, z + s * dz, guess, stack)
-            at = s * (len(bow) - 1)
-            k = min(int(at), max(len(bow) - 2, 0))
-            value += bow[k]
-            if len(bow) > 1:
-                value += (at - k) * (bow[k + 1] - bow[k])
+            gain = _between(bow, s)
+            if guess >= 0 and value <= -t.margin[guess]:
+                # In an obstacle: all needles of the cell may pass through obstacles here.
+                px, py, pz = x + s * dx, y + s * dy, z + s * dz
+                if _depth(gaps, px, py, pz, stack) > gain + (1.0 - s) * radii[i]:
+                    upper = min(upper, 0.0)
+            value += gain
             if value < least:
                 least, place = value, s
             upper = min(upper, value + (1.0 - s) * radii[i])

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 from needle_dynamics import FloatArray
@@ -33,10 +32,10 @@ def affine(
     return found
 
 
-def center(anatomy: Anatomy, index: Sequence[float]) -> FloatArray:
+def center(anatomy: Anatomy, index: ArrayLike) -> FloatArray:
     """Return the position of a voxel index [m]."""
     matrix = anatomy.to_patient
-    return matrix[:3, :3] @ np.array(index, dtype=float) + matrix[:3, 3]
+    return matrix[:3, :3] @ np.asarray(index, dtype=float) + matrix[:3, 3]
 
 
 def liver(shape: tuple[int, int, int] = (512, 512, 200), seed: int = 0) -> Anatomy:

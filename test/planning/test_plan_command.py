@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`needle plan`: result, file, and errors of invalid input."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from needle_insertion.cli import main
+from needle_planning import read_plan
+import numpy as np
+import pytest
+
+LIVER = Path(__file__).parents[2] / 'examples' / 'liver'
+WORDS = ('plan', str(LIVER / 'liver.seg.nrrd'), '--labels', str(LIVER / 'labels.yaml'))
+TARGET = '62mm,12mm,10mm'
+
+
+def test_plan_of_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Text, JSON and file have the same plan."""
+    file = tmp_path / 'plan.yaml'
+    assert main([*WORDS, '--target', TARGET, '--straight', '-o', str(file)]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith('path found in ')
+    assert text.endswith(f'wrote {file}\n')
+    assert main([*WORDS, '--target', TARGET, '--straight', '--json']) == 0
+    found, plan = json.loads(capsys.readouterr().out), read_plan(file)
+    assert found['entry [m]'] == plan.entry.tolist()
+    assert found['clearance [m]'] == plan.clearance > 0.0
+    assert f'clearance {1e3 * plan.clearance:.2f} mm to {plan.structure}' in text
+    assert np.allclose(plan.target, [0.062, 0.012, 0.01])
+    assert plan.resolution == 5e-4
+
+
+@pytest.mark.parametrize(
+    ('words', 'status', 'message'),
+    [
+        ((f'--target={TARGET}', '--entry', '150mm,0,0'), 1, 'no straight path to a resolution'),
+        (('--target', '-0.4,0,0'), 2, 'the target -400.0, 0.0, 0.0 mm is outside the image'),
+        (('--target', '55mm,0,-20mm'), 2, 'the target is in portal vein'),
+        (('--target', '55mm,0'), 2, '--target must be R,A,S, such as'),
+        ((f'--target={TARGET}', '--entry', 'skin'), 2, 'entry must be one of body, entry,'),
+        ((f'--target={TARGET}', '--entry=-1,0,0,2'), 2, '--entry must be R,A,S, such as'),
+        ((f'--target={TARGET}', '--entry', '0.3,0,0'), 2, 'is too short: the nearest entry'),
+        ((f'--target={TARGET}', '--needle', 'none'), 2, 'needle must be one of'),
+        ((f'--target={TARGET}', '-o', '/none/plan.yaml'), 2, 'its folder does not exist'),
+    ],
+)
+def test_invalid_request_is_one_line(
+    words: tuple[str, ...], status: int, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*WORDS, *words]) == status
+    said = capsys.readouterr()
+    assert said.out == ''
+    assert said.err.startswith('error: ')
+    assert message in said.err
+    assert len(said.err.splitlines()) == 1
