@@ -178,7 +178,7 @@ def find_plan(
     ... )
     >>> plan = find_plan(anatomy, (0.03, 0.03, 0.01), bow=False)
     >>> print(plan.structure, f'{1e3 * plan.clearance:.0f} mm')
-    bone 13 mm
+    bone 10 mm
 
     """
     every = [anatomy] if isinstance(anatomy, Anatomy) else list(anatomy)
