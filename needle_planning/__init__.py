@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from needle_planning.anatomy import SegmentationError as SegmentationError
     from needle_planning.anatomy import Structure as Structure
     from needle_planning.labels import read_anatomy as read_anatomy
-    from needle_planning.plan import find_plan as find_plan
-    from needle_planning.plan import NoPathError as NoPathError
     from needle_planning.plan import Plan as Plan
     from needle_planning.plan import read_plan as read_plan
     from needle_planning.plan import write_plan as write_plan
+    from needle_planning.planner import find_plan as find_plan
+    from needle_planning.planner import NoPathError as NoPathError
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -27,7 +27,7 @@ _TIGHT: Final = (5e-5, 5e-6)
 _ROUNDS: Final = 24  #: Divisions of a patch into halves.
 
 
-class Insertion(NamedTuple):
+class SimulatedInsertion(NamedTuple):
     """Simulated insertion along a line, with its clearance."""
 
     path: FloatArray  #: position of the tip at each depth [m], shape (n + 1, 3)
@@ -47,7 +47,7 @@ def simulate_insertion(
     depths: FloatArray,
     guide: FloatArray,
     roll: float = 0.0,
-) -> Insertion:
+) -> SimulatedInsertion:
     """
     Insert a needle without uncertainty, and bound its clearance from below.
 
@@ -68,7 +68,7 @@ def simulate_insertion(
 
     Returns
     -------
-    Insertion
+    SimulatedInsertion
         Clearances are lower bounds, at most 50 um below the true ones, 5 um for a straight needle.
 
     """
@@ -115,7 +115,7 @@ def simulate_insertion(
         step = np.array(steps[1:])[:, np.newaxis]
     least, place = _least_clearances(clearance, surface, step, len(depths), _TIGHT[straight])
     least = (np.minimum.accumulate(least) if straight else least) - sag
-    return Insertion(
+    return SimulatedInsertion(
         path=line.points(depths, np.array(tips)),
         clearances=least,
         clearance=float(least.min()),

@@ -12,7 +12,8 @@ from needle_dynamics.needles import DEFAULT_NEEDLE
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import table
-from needle_planning.plan import find_plan, Plan, write_plan
+from needle_planning.plan import Plan, write_plan
+from needle_planning.planner import find_plan
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import quantities
 import numpy as np

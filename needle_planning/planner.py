@@ -1,0 +1,407 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Planner: entry point and guide setpoints with the largest clearance to the obstacles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final, TypeAlias
+
+from needle_controller.steering.settings import SteeringLimits
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle, NeedlePreset
+from needle_planning.anatomy import Anatomy
+from needle_planning.certificate import simulate_insertion, SimulatedInsertion
+from needle_planning.clearance import Clearance, image_frame
+from needle_planning.paths import (
+    best_bow,
+    bow_profile,
+    guide_axes,
+    Line,
+    needle_radius,
+    path_responses,
+    STEEPEST,
+    step_depths,
+)
+from needle_planning.plan import Plan
+from needle_planning.search import disc_region, EntryRegion, Lines, search_lines, voxel_region
+from needle_ros.errors import JobError, ParameterError
+from needle_ros.settings import is_number
+import numpy as np
+from numpy.typing import ArrayLike
+
+_CANDIDATES: Final = 4  #: Lines for which the best bow is computed.
+_APART: Final = 2e-3  #: Least distance of their entry points [m].
+_PARTS: Final = 16  #: Parts of a line with a largest bow each.
+_LENGTHS: Final = 0.02  #: Distance of the lengths for which the largest bow is computed [m].
+_MORE: Final = 1.1  #: Factor of the largest bow, for the lengths and places between.
+_OFF: Final = 1e-4  #: Largest distance of the tip from the target in the simulation [m].
+_FINEST: Final = 1e-4  #: Least resolution [m].
+#: Part of the resolution for the search; the rest is for the check of the plan.
+_SEARCHED: Final = 0.9
+#: Factor of the limits of slope and load in the simulation, which is linear to a few percent.
+_LINEAR: Final = 1.05
+
+
+#: Line, guide setpoints, depths and simulated insertion of a plan.
+_Best: TypeAlias = tuple[Line, FloatArray, FloatArray, SimulatedInsertion]
+
+
+class NoPathError(JobError):
+    """No needle path has a positive clearance; `bound` is an upper bound on the clearance [m]."""
+
+    def __init__(self, message: str, bound: float) -> None:
+        super().__init__(message)
+        self.bound = bound
+
+
+def find_plan(
+    anatomy: Anatomy | Sequence[Anatomy],
+    target: ArrayLike,
+    *,
+    entry: str | ArrayLike | None = None,
+    entry_radius: float = 0.01,
+    needle: str = DEFAULT_NEEDLE,
+    limits: SteeringLimits | None = None,
+    roll: float = 0.0,
+    bow: bool = True,
+    resolution: float = 5e-4,
+    progress: Callable[[str], object] | None = None,
+) -> Plan:
+    """
+    Find the entry point and the guide setpoints with the largest clearance along the needle.
+
+    Parameters
+    ----------
+    anatomy : Anatomy or sequence of Anatomy
+        Image with obstacles, or several images in the same patient coordinates.
+    target : array_like, shape (3,)
+        Target of the tip in patient coordinates, RAS [m].
+    entry : str or array_like, shape (3,), optional
+        Name of the structure where the needle may enter, or an entry point; by default all
+        structures with the role ``entry``.
+    entry_radius : float
+        Radius of the disc of entry points around an entry point [m].
+    needle : str
+        Needle and tissue, see `find_needle`.
+    limits : SteeringLimits, optional
+        Step length, and limits of guide position, guide motion and lateral load.
+    roll : float
+        Roll of the needle [rad].
+    bow : bool
+        Whether the guide may bow the needle where this increases the clearance.
+    resolution : float
+        Resolution h of the search [m].
+    progress : callable, optional
+        Called with a description of each part of the search.
+
+    Returns
+    -------
+    Plan
+        A straight plan has the largest clearance of all straight needles, less at most h. A bowed
+        plan has more than h in addition.
+
+    Raises
+    ------
+    NoPathError
+        No straight needle has a clearance above h; the message has the result for bowed needles.
+    ParameterError
+        An argument is not valid: a target outside the image or in an obstacle, an entry region
+        without voxels, or a needle that is too short.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from needle_planning import Anatomy, find_plan, Structure
+    >>> labels = np.zeros((60, 60, 80), dtype=np.int16)
+    >>> labels[:, :, 78], labels[10:34, :, 50] = 1, 2
+    >>> structures = {
+    ...     1: Structure(name='skin', role='entry'),
+    ...     2: Structure(name='bone', role='obstacle', margin=2e-3),
+    ... }
+    >>> anatomy = Anatomy(
+    ...     labels=labels, to_patient=np.diag([1e-3, 1e-3, 1e-3, 1.0]), structures=structures
+    ... )
+    >>> plan = find_plan(anatomy, (0.03, 0.03, 0.01), bow=False)
+    >>> print(plan.structure, f'{1e3 * plan.clearance:.0f} mm')
+    bone 10 mm
+
+    """
+    every = [anatomy] if isinstance(anatomy, Anatomy) else list(anatomy)
+    planner = _Planner(
+        every, target, entry, entry_radius, needle, limits or SteeringLimits(), roll, resolution
+    )
+    return planner.plan(bow, progress or (lambda _: None))
+
+
+class _Planner:
+    """Search for one target, with checked arguments."""
+
+    def __init__(
+        self,
+        anatomies: Sequence[Anatomy],
+        target: ArrayLike,
+        entry: str | ArrayLike | None,
+        entry_radius: float,
+        needle: str,
+        limits: SteeringLimits,
+        roll: float,
+        resolution: float,
+    ) -> None:
+        self.target = _point('target', target)
+        if not is_number(resolution) or not resolution >= _FINEST:
+            raise ParameterError(f'resolution must be >= {_FINEST:g} m, got {resolution!r}')
+        self.name, self.limits, self.roll = needle, limits, roll
+        self.resolution = float(resolution)
+        self.preset = _usable(needle)
+        self.radius = needle_radius(self.preset.needle)
+        self.reach = self.preset.needle.length - self.preset.steering.free_length
+        _check_inside(anatomies, self.target)
+        region = _region(anatomies, self.target, entry, entry_radius)
+        lengths = np.linalg.norm(region.centers - self.target, axis=1)
+        near = lengths - region.radius <= self.reach
+        if not near.any():
+            raise ParameterError(
+                f'the needle {needle} is too short: the nearest entry point is '
+                f'{1e3 * lengths.min():.1f} mm from the target, it reaches {1e3 * self.reach:.1f} '
+                'mm (length without free_length)'
+            )
+        self.region = region._replace(centers=region.centers[near])
+        self.lengths = lengths[near]
+        self.clearance = Clearance(
+            anatomies,
+            np.vstack([self.region.centers, self.target]),
+            radius=self.radius,
+            beyond=region.radius + 2.0 * limits.guide_limit,
+        )
+        self.at_target = at_target = float(self.clearance.at(self.target[np.newaxis])[0])
+        if at_target <= 0.0:
+            name = self.clearance.structure_at(self.target)
+            raise ParameterError(
+                f'the target is in {name} or {-1e3 * at_target:.2f} mm too near to it: its margin '
+                f'and the radius of the needle, {1e3 * self.radius:.2f} mm, must be free'
+            )
+
+    def plan(self, bow: bool, progress: Callable[[str], object]) -> Plan:
+        lines = self._search(progress)
+        bevel = max(self.preset.steering.bevel_load) > 0.0
+        if bevel and self.limits.guide_limit == 0.0:
+            raise ParameterError('guide_limit must be > 0 m for a needle with a bevel')
+        best = None
+        if not bevel and len(lines.entries):
+            best = self._straight(lines.entries[0])
+        bound = lines.bound
+        bows = self.limits.guide_limit > 0.0 and (bow or bevel)
+        # Every path ends at the target: its clearance is a bound, too.
+        limited = best is not None and best[3].clearance + self.resolution >= self.at_target
+        if bows and limited:
+            bound = self.at_target
+        elif bows:
+            profile = self._profile(progress)
+            curved = self._search(progress, profile)
+            bound = max(curved.bound, bound)
+            best = self._bowed(best, self._candidates(lines, curved), profile, progress)
+        if best is None:
+            raise self._no_path(lines, bound, bows)
+        line, guide, depths, found = best
+        return Plan(
+            needle=self.name,
+            radius=self.radius,
+            entry=line.entry,
+            direction=line.axes[1],
+            target=self.target,
+            roll=self.roll,
+            depths=depths,
+            guide=guide,
+            path=found.path,
+            clearances=found.clearances,
+            clearance=found.clearance,
+            structure=self.clearance.structure_at(found.place),
+            place=found.place,
+            bow=found.bow,
+            resolution=self.resolution,
+            straight_bound=lines.bound,
+            bound=bound,
+        )
+
+    def _search(self, progress: Callable[[str], object], bow: FloatArray | None = None) -> Lines:
+        kind = 'straight: ' if bow is None else 'with a bow: '
+        return search_lines(
+            self.clearance,
+            self.region,
+            self.target,
+            self.reach,
+            _SEARCHED * self.resolution,
+            bow=np.zeros(1) if bow is None else bow,
+            progress=lambda part: progress(kind + part),
+        )
+
+    def _line(self, entry: FloatArray) -> Line:
+        return Line(entry, guide_axes(self.target - entry))
+
+    def _insert(self, line: Line, guide: FloatArray) -> tuple[FloatArray, SimulatedInsertion]:
+        needle, steering, _ = self.preset
+        length = float(np.linalg.norm(self.target - line.entry))
+        depths = np.linspace(0.0, length, len(guide) + 1)
+        return depths, simulate_insertion(
+            self.clearance, line, needle, steering, depths, guide, self.roll
+        )
+
+    def _straight(self, entry: FloatArray) -> _Best | None:
+        line = self._line(entry)
+        length = float(np.linalg.norm(self.target - entry))
+        guide = np.zeros((len(step_depths(length, self.limits.step_length)) - 1, 2))
+        depths, found = self._insert(line, guide)
+        return (line, guide, depths, found) if found.clearance > 0.0 else None
+
+    def _profile(self, progress: Callable[[str], object]) -> FloatArray:
+        """Return the largest bow at equal fractions of a line of any length, shape (p,)."""
+        needle, steering, _ = self.preset
+        shortest = max(self.lengths.min() - self.region.radius, self.limits.step_length)
+        longest = max(min(self.lengths.max() + self.region.radius, self.reach), shortest)
+        count = max(2, int(np.ceil((longest - shortest) / _LENGTHS)) + 1)
+        found = np.zeros(_PARTS + 1)
+        for length in np.linspace(shortest, longest, count).tolist():
+            progress(f'largest bow at {1e3 * length:.0f} mm')
+            responses = path_responses(needle, steering, length, self.limits.step_length)
+            found = np.maximum(found, bow_profile(responses, self.limits, self.roll, _PARTS))
+        return _MORE * found
+
+    def _candidates(self, *searches: Lines) -> list[FloatArray]:
+        """Return entry points that are not close to each other, the most promising ones first."""
+        found: list[FloatArray] = []
+        for lines in searches:
+            entries = lines.entries
+            for _ in range(_CANDIDATES // len(searches)):
+                if not len(entries):
+                    break
+                entry = entries[0]
+                found.append(entry)
+                away = np.linalg.norm(entries - entry, axis=1)
+                entries = entries[away > _APART]
+        return found
+
+    def _bowed(
+        self,
+        best: _Best | None,
+        entries: Sequence[FloatArray],
+        profile: FloatArray,
+        progress: Callable[[str], object],
+    ) -> _Best | None:
+        """Return the best plan with a bow, if it gains more than the resolution."""
+        needle, steering, _ = self.preset
+        chosen, least = best, 0.0 if best is None else best[3].clearance + self.resolution
+        for k, entry in enumerate(entries, 1):
+            progress(f'best bow of line {k} of {len(entries)}')
+            # Least clearance with the largest bow at each place.
+            if self.clearance.lines(entry, self.target, bow=profile).least[0] <= least:
+                continue
+            line = self._line(entry)
+            length = float(np.linalg.norm(self.target - entry))
+            responses = path_responses(needle, steering, length, self.limits.step_length)
+            bow = best_bow(self.clearance, line, responses, self.limits, self.roll)
+            if bow is None or bow.clearance <= least:
+                continue
+            depths, found = self._insert(line, bow.guide)
+            off = float(np.linalg.norm(found.path[-1] - self.target))
+            valid = off <= _OFF and found.slope <= _LINEAR * STEEPEST
+            valid &= found.load <= _LINEAR * self.limits.load_limit
+            if found.clearance > least and valid:
+                chosen, least = (line, bow.guide, depths, found), found.clearance
+        return chosen
+
+    def _no_path(self, lines: Lines, bound: float, bows: bool) -> NoPathError:
+        h = 1e3 * self.resolution
+        entry = lines.entries[0] if len(lines.entries) else lines.nearest
+        found = self.clearance.lines(entry, self.target)
+        place = entry + float(found.places[0]) * (self.target - entry)
+        name = self.clearance.structure_at(place)
+        least, depth = 1e3 * float(found.least[0]), 1e3 * np.linalg.norm(place - entry)
+        text = (
+            f'no straight path to a resolution of {h:g} mm: the best line is {-least:.2f} mm too '
+            f'near to {name}, at a depth of {depth:.1f} mm'
+        )
+        if least > 0.0:
+            text = (
+                f'no path found for a needle with a bevel, a straight one has a clearance of '
+                f'{least:.2f} mm'
+            )
+        if not bows:
+            return NoPathError(text, bound)
+        slope = f'slopes up to {STEEPEST:g}, for which the model of the needle holds'
+        if bound <= self.resolution:
+            return NoPathError(f'{text}; no path with a bow either, with {slope}', bound)
+        return NoPathError(
+            f'{text}; no bow was found with {slope}, but it is not excluded (clearance up to '
+            f'{1e3 * bound:.2f} mm)',
+            bound,
+        )
+
+
+def _point(name: str, values: ArrayLike) -> FloatArray:
+    found = np.array(values, dtype=np.float64)
+    if found.shape != (3,) or not np.isfinite(found).all():
+        raise ParameterError(f'{name} must have 3 finite coordinates, got {values!r}')
+    return found
+
+
+def _usable(name: str) -> NeedlePreset:
+    found = find_needle(name)
+    if not found.needle.tissue_stiffness > 0.0:
+        raise ParameterError(
+            f'the needle {name} must be in tissue that bends it: tissue_stiffness > 0 N/m^2'
+        )
+    if found.steering.free_length >= found.needle.length:
+        raise ParameterError(
+            f'free_length must be < length = {found.needle.length:g} m, got '
+            f'{found.steering.free_length:g} m'
+        )
+    return found
+
+
+def _check_inside(anatomies: Sequence[Anatomy], target: FloatArray) -> None:
+    shown = []
+    for anatomy in anatomies:
+        frame, shape = image_frame(anatomy), np.array(anatomy.labels.shape)
+        index = frame.of_patient(target) / frame.spacing
+        if (index >= -0.5).all() and (index <= shape - 0.5).all():
+            return
+        corners = frame.to_patient(np.array([np.full(3, -0.5), shape - 0.5]) * frame.spacing)
+        ranges = (f'{1e3 * a:.0f} to {1e3 * b:.0f}' for a, b in np.sort(corners, axis=0).T)
+        shown.append(', '.join(ranges))
+    at = ', '.join(f'{1e3 * one:.1f}' for one in target)
+    raise ParameterError(
+        f'the target {at} mm is outside the image, whose corners are at {"; ".join(shown)} mm'
+    )
+
+
+def _region(
+    anatomies: Sequence[Anatomy], target: FloatArray, entry: str | ArrayLike | None, radius: float
+) -> EntryRegion:
+    if entry is not None and not isinstance(entry, str):
+        if not is_number(radius) or radius < 0.0:
+            raise ParameterError(f'entry_radius must be >= 0 m, got {radius!r}')
+        point = _point('entry', entry)
+        if not np.linalg.norm(target - point) > radius:
+            raise ParameterError(
+                f'the entry point must be further from the target than entry_radius {radius:g} m'
+            )
+        return disc_region(point, float(radius), target)
+    names = sorted({one.name for anatomy in anatomies for one in anatomy.structures.values()})
+    if isinstance(entry, str) and entry not in names:
+        raise ParameterError(f'entry must be one of {", ".join(names)}, got {entry!r}')
+    found = []
+    for anatomy in anatomies:
+        labels = [
+            label
+            for label, one in anatomy.structures.items()
+            if (one.role == 'entry' if entry is None else one.name == entry)
+        ]
+        region = voxel_region(anatomy, labels, target) if labels else None
+        found += [] if region is None else [region]
+    if len(found) > 1:
+        raise ParameterError('the entry region must be in one image: name its structure')
+    if not found:
+        raise ParameterError(
+            f'no voxel belongs to the entry region {entry or "(role entry)"}: give an entry point'
+        )
+    return found[0]
