@@ -207,7 +207,9 @@ def inserted_shape(needle: SteeredNeedle, points: FloatArray) -> tuple[FloatArra
 class _Program:
     """Linear constraints on the guide setpoints, equal in x and z but for the bevel."""
 
-    def __init__(self, responses: PathResponses, limits: SteeringLimits, roll: float) -> None:
+    def __init__(
+        self, responses: PathResponses, limits: SteeringLimits, roll: float, *, slopes: bool = True
+    ) -> None:
         from scipy.sparse import csr_array, eye_array, vstack
 
         self.responses, r, n = responses, responses, len(responses.depths) - 1
@@ -215,7 +217,7 @@ class _Program:
         self.change = csr_array(eye_array(n) - eye_array(n, k=-1))
         rows, offsets, most = [self.change], [np.zeros(n)], [np.full(n, limits.guide_step)]
         # Each plane has an equal part of the largest slope; every fourth point is enough.
-        some = np.union1d(np.arange(0, len(r.rows), 4), r.last)
+        some = np.union1d(np.arange(0, len(r.rows), 4), r.last)[: None if slopes else 0]
         rows += [r.loads, r.slopes[some]]
         offsets += [r.loads_bevel, r.slopes_bevel[some]]
         most += [np.full(n, limits.load_limit), np.full(len(some), STEEPEST / sqrt(2.0))]
@@ -269,15 +271,19 @@ class _Program:
         # Variables: guide in x and z, travel of both, clearance.
         change = block_diag([self.change] * 2)
         travel = eye_array(2 * n)
+        # Only limits within the trust region.
+        limits = csr_array(block_diag([self.matrix] * 2))
+        slack = self.bounds.ravel() - limits @ guide
+        near = slack <= trust * abs(limits).sum(axis=1)
         rows = vstack(
             [
                 hstack([csr_array(-gain), csr_array((len(gain), 2 * n)), np.ones((len(gain), 1))]),
                 hstack([change, -travel, csr_array((2 * n, 1))]),
                 hstack([-change, -travel, csr_array((2 * n, 1))]),
-                self._wide(block_diag([self.matrix] * 2)),
+                self._wide(limits[near]),
             ]
         )
-        bounds = [values[active] - gain @ guide, np.zeros(4 * n), self.bounds.ravel()]
+        bounds = [values[active] - gain @ guide, np.zeros(4 * n), self.bounds.ravel()[near]]
         low, high = np.maximum(guide - trust, -self.both), np.minimum(guide + trust, self.both)
         box = [*zip(low, high, strict=True), *[(0.0, None)] * (2 * n), (None, None)]
         cost = np.concatenate([np.zeros(2 * n), np.full(2 * n, _TRAVEL), [-1.0]])
@@ -323,7 +329,8 @@ def bow_profile(
     at most the root of 2 times the largest one along an axis. Between two fractions the largest
     deflection is at most the linear interpolation. Shape (parts + 1,) [m].
     """
-    program, r = _Program(responses, limits, roll), responses
+    # Without the limit of the slope, which changes the bound by a few percent.
+    program, r = _Program(responses, limits, roll, slopes=False), responses
 
     def largest(row: int) -> float:
         found = 0.0
