@@ -36,7 +36,8 @@ class LineClearance(NamedTuple):
     """Least clearance of straight lines."""
 
     least: FloatArray  #: least clearance with the gain, -inf for a line that ended early [m], (m,)
-    upper: FloatArray  #: upper bound for all entry points within the radius [m], (m,)
+    #: Upper bound for all needles within the radius, deflected by the gain at most [m], (m,).
+    upper: FloatArray
     places: FloatArray  #: fraction of the line at the least clearance, (m,)
 
 

@@ -98,7 +98,8 @@ class Lines:
 
     entries: FloatArray  #: entry points that are long enough, the best one first [m], shape (m, 3)
     clearances: FloatArray  #: least clearance of their lines with the gain [m], shape (m,)
-    bound: float  #: no line of the region has a larger clearance with the gain [m]
+    #: No needle from the region has a larger clearance if the gain bounds its deflection [m].
+    bound: float
     nearest: FloatArray  #: entry point with the largest bound of all discarded cells [m], (3,)
 
 
@@ -163,8 +164,8 @@ def search_lines(
     Returns
     -------
     Lines
-        If the largest clearance is c, the first line has at least c - h; if the search finds no
-        line with a positive clearance, c is at most h.
+        If the largest clearance of a straight line is c, the first line has at least c - h; if the
+        search finds no line with a positive clearance, c is at most h.
 
     """
     if not resolution > 0.0:

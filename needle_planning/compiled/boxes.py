@@ -146,9 +146,10 @@ def line_clearances(
     # ``entries``, shape (m, 3), and ``target``, shape (3,) [m]; ``bow``, shape (p,): gain at equal
     # fractions of each line, from entry to target [m]; ``radii``, shape (m,): distance of further
     # entry points. Outputs in ``found``, shape (m, 3): least value of clearance and gain at the
-    # examined points of the line; upper bound for all entry points within the radius; fraction of
-    # the line at the least value. The true least value is within ``tolerance`` of the first. A
-    # line ends early, with -inf, when its upper bound is at most ``enough``.
+    # examined points of the line; upper bound on the clearance of all needles from an entry point
+    # within the radius, deflected by the gain at most; fraction of the line at the least value.
+    # The true least value is within ``tolerance`` of the first. A line ends early, with -inf, when
+    # its upper bound is at most ``enough``.
     t, gaps, stack = boxed.value, free.value, np.empty(_DEEPEST, np.int64)
     for i in range(len(entries)):
         x, y, z = entries[i, 0], entries[i, 1], entries[i, 2]
