@@ -1,0 +1,387 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write the page of a plan: sections of the anatomy with the needle, clearance and guide."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import ceil
+from pathlib import Path
+from textwrap import shorten
+from typing import Any, Final, NamedTuple
+
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.needles import find_needle
+from needle_dynamics.steering.needle import SteeredNeedle
+from needle_insertion.report.content import Picture
+from needle_insertion.report.page import write_page
+from needle_insertion.report.section import (
+    draw_section,
+    halo,
+    Legend,
+    legend_of,
+    MARGIN_COLOR,
+    Plane,
+    sample,
+    Section,
+    section,
+)
+from needle_planning.anatomy import Anatomy, ROLES, Structure
+from needle_planning.clearance import Clearance
+from needle_planning.paths import inserted_shape, Line
+from needle_planning.plan import Plan
+from needle_ros.errors import ParameterError
+import numpy as np
+
+_AROUND: Final = 0.015  #: Length before the entry point and beyond the target in a section [m].
+_HALF: Final = (0.02, 0.035, 0.06)  #: Half of the width: least, usual and largest [m].
+_PIXELS: Final = 880  #: Pixels along the longer side of a section.
+_POINTS: Final = 5e-4  #: Distance of the points of the shaft [m].
+#: Largest difference of clearance and tip between plan and page; the plan states it to 50 um [m].
+_SAME: Final = 2e-4
+_WIDTH: Final = 8.0  #: Width of a picture [inches].
+_VISIBLE: Final = 1e-4  #: Distance from a section that is stated [m].
+#: Characters in the width of a picture, and of the longest name in a legend.
+_CHARACTERS, _LONGEST = 120, 40
+#: Heads of the columns of a plan, and of the structure.
+_HEADS: Final = (
+    'depth [mm]', 'guide x [mm]', 'guide z [mm]', 'tip R [mm]', 'tip A [mm]', 'tip S [mm]',
+    'clearance [mm]', 'limited by',
+)  # fmt: skip
+_MARKERS: Final = 'osD^vPX'  #: Markers of the structures of the chart.
+
+
+class _Shaft(NamedTuple):
+    """Needle of a plan, in patient coordinates."""
+
+    final: FloatArray  #: points from outside the skin to the tip at the end [m], shape (k, 3)
+    limits: list[str]  #: structure with the least clearance in the step to each depth
+
+
+def write_plan_page(plan: Plan, anatomy: Anatomy | Sequence[Anatomy], path: Path | str) -> None:
+    """
+    Write the page of a plan, and its pictures in the same folder.
+
+    Parameters
+    ----------
+    plan : Plan
+        Plan in this anatomy.
+    anatomy : Anatomy or sequence of Anatomy
+        Segmented images, as for `find_plan`.
+    path : Path or str
+        File to write (.html).
+
+    Raises
+    ------
+    ParameterError
+        The plan is outside the images, or does not fit the anatomy or the needle.
+
+    """
+    every = [anatomy] if isinstance(anatomy, Anatomy) else list(anatomy)
+    legend = legend_of(every, plan.structure)
+    planes = _planes(plan, legend)
+    clearance = Clearance(
+        every, np.concatenate([one.corners for one in planes]), radius=plan.radius
+    )
+    _check(plan, every, legend, clearance)
+    shaft = _shaft(plan, clearance)
+    pictures = [
+        _picture(plan, legend, shaft, name, section(every, legend, clearance, plan.radius, one))
+        for name, one in zip(('plan_x', 'plan_z', 'plan_across'), planes, strict=True)
+    ]
+    near = f'to {plan.structure}' if plan.structure else 'to all obstacles'
+    bent = plan.guide.any()
+    write_page(
+        Path(path),
+        'plan.html',
+        [*pictures, _by_depth(plan, legend, shaft)],
+        introduction=f'Needle {plan.needle} from the skin to the target, '
+        f'{"bowed by the guide" if bent else "straight"}, in {len(plan.guide)} steps. '
+        'Clearances are beyond the margins of the obstacles.',
+        cards=[
+            ('Least clearance', f'{_mm(plan.clearance)} mm', near),
+            ('Length', f'{_mm(plan.length)} mm', f'{len(plan.guide)} steps'),
+            ('Bow', f'{_mm(plan.bow)} mm', 'largest deflection from the straight line'),
+        ],
+        sections=pictures,
+        guide='The guide is at zero until the needle has pierced the skin. It moves to the '
+        'setpoint of a step while the needle rests, and rests while the needle is inserted.'
+        if bent
+        else 'The guide stays at zero.',
+        points=_positions(plan),
+        values=_values(plan),
+        step_heads=_HEADS,
+        steps=_steps(plan, shaft),
+        structures=[
+            (one.name, one.role, _mm(one.margin) if one.role == ROLES[0] else '')
+            for one in legend.structures
+        ],
+    )
+
+
+def _mm(value: float) -> str:
+    # Without a sign of zero.
+    return f'{1e3 * value + 0.0:.2f}'.replace('-0.00', '0.00')
+
+
+def _positions(plan: Plan) -> list[tuple[str, ...]]:
+    named = {'entry': plan.entry, 'target': plan.target, 'least clearance': plan.place}
+    rows = [(name, *map(_mm, at)) for name, at in named.items()]
+    axes = zip(('guide axis x', 'direction (y)', 'guide axis z'), plan.axes, strict=True)
+    return rows + [(name, *(f'{one + 0.0:.4f}' for one in axis)) for name, axis in axes]
+
+
+def _values(plan: Plan) -> list[tuple[str, str, str]]:
+    lengths = (
+        ('needle radius', plan.radius, 'subtracted from each distance'),
+        ('length', plan.length, 'straight line from entry point to target'),
+        ('largest bow', plan.bow, 'deflection of the shaft from the straight line'),
+        ('clearance', plan.clearance, f'least one, {plan.structure or "beyond 30 mm"}'),
+        ('resolution', plan.resolution, 'of the search'),
+        ('bound straight', plan.straight_bound, 'no straight needle has more'),
+        ('bound', plan.bound, 'no needle within the limits of the guide has more'),
+    )
+    return [
+        ('needle', plan.needle, 'name or file'),
+        ('roll', f'{np.degrees(plan.roll):.2f} deg', 'rotation about its axis'),
+        *((name, f'{_mm(value)} mm', meaning) for name, value, meaning in lengths),
+    ]
+
+
+def _steps(plan: Plan, shaft: _Shaft) -> list[tuple[str, ...]]:
+    rows = zip(*plan.columns().values(), strict=True)
+    return [(*map(_mm, row), name) for row, name in zip(rows, shaft.limits, strict=True)]
+
+
+def _planes(plan: Plan, legend: Legend) -> list[Plane]:
+    """Return two planes that contain the line, and one perpendicular to it."""
+    margin = max(
+        (one.margin for one in legend.structures if one.name == plan.structure), default=0
+    )
+    # The structure that limits the clearance is visible.
+    needed = 1.3 * (plan.clearance + margin + plan.radius) + plan.bow + 5e-3
+    least, usual, most = _HALF
+    half = float(np.clip(max(min(0.3 * plan.length, usual), needed), least, most))
+    x, y, z = plan.axes
+    low = np.array([-_AROUND, -half])
+    high = np.array([plan.length + _AROUND, half])
+    pixel = float((high - low).max()) / _PIXELS
+    across = plan.entry + float((plan.place - plan.entry) @ y) * y
+    return [
+        Plane(plan.entry, np.stack([y, x]), low, high, pixel),
+        Plane(plan.entry, np.stack([y, z]), low, high, pixel),
+        Plane(across, np.stack([x, z]), np.full(2, -half), np.full(2, half), 4.0 * half / _PIXELS),
+    ]
+
+
+def _check(plan: Plan, anatomies: Sequence[Anatomy], legend: Legend, clearance: Clearance) -> None:
+    """Raise `ParameterError` if a plan is not of these images."""
+    ends = np.stack([plan.entry, plan.target])
+    along = np.linspace(ends[0], ends[1], 100)
+    if (sample(anatomies, legend.structures, along) < -1).all():
+        at = ', '.join(map(_mm, plan.target))
+        raise ParameterError(f'the plan to the target {at} mm is outside the image')
+    found = float(clearance.at(plan.place[np.newaxis])[0])
+    if not abs(found - plan.clearance) < _SAME:
+        raise ParameterError(
+            f'the plan is of another anatomy: it has a clearance of {_mm(plan.clearance)} mm, and '
+            f'{_mm(found)} mm at the same place in this anatomy'
+        )
+
+
+def _shaft(plan: Plan, clearance: Clearance) -> _Shaft:
+    """Insert the needle of a plan."""
+    needle, steering, _ = find_needle(plan.needle)
+    one = SteeredNeedle(needle, replace(steering, path_noise=0.0), roll=plan.roll)
+    line = Line(plan.entry, plan.axes)
+    limits = [clearance.structure_at(plan.entry)]
+    points = np.empty((0, 3))
+    for guide, depth in zip(plan.guide.tolist(), plan.depths[1:].tolist(), strict=True):
+        one.move(guide=guide)
+        before = _points(one, line, 0.0)
+        one.move(depth=depth)
+        points = np.concatenate([before, _points(one, line, 0.0)])
+        limits.append(clearance.structure_at(points[clearance.at(points).argmin()]))
+    off = float(np.linalg.norm(points[-1] - plan.path[-1]))
+    if not off < _SAME:
+        raise ParameterError(
+            f'the needle {plan.needle} is not the one of the plan: its tip ends {_mm(off)} mm '
+            'from the path'
+        )
+    return _Shaft(_points(one, line, -min(_AROUND, steering.free_length)), limits)
+
+
+def _points(needle: SteeredNeedle, line: Line, start: float) -> FloatArray:
+    count = max(2, round((needle.depth - start) / _POINTS) + 1)
+    depths = np.linspace(start, needle.depth, count)
+    return line.points(depths, inserted_shape(needle, depths)[0])
+
+
+def _picture(plan: Plan, legend: Legend, shaft: _Shaft, name: str, shown: Section) -> Picture:
+    from matplotlib.figure import Figure
+
+    plane, across = shown.plane, name == 'plan_across'
+    wide, tall = plane.high - plane.low
+    width = (0.6 if across else 0.88) * _WIDTH
+    drawing = Figure(figsize=(_WIDTH, width * tall / wide))
+    # The height is fitted to the legend below.
+    left = 0.5 - 0.5 * width / _WIDTH if across else 0.1
+    axes = drawing.add_axes((left, 0.0, width / _WIDTH, 1.0))
+    line, tip = plane.coordinates(shaft.final), plane.coordinates(plan.path)
+    place, target = plane.coordinates(np.stack([plan.place, plan.target]))
+    if across:
+        around = (plan.radius + plan.clearance) * _circle()
+        draw_section(axes, shown, legend, place + np.concatenate([0.5 * around, around]))
+        marks = _draw_circles(axes, plan, place)
+        depth = (plan.place - plan.entry) @ plan.axes[1]
+        near = f' to {plan.structure}' if plan.structure else ''
+        words = (
+            f'Section perpendicular to the line at a depth of {_mm(depth)} mm, at the least '
+            f'clearance: {_mm(plan.clearance)} mm{near}.'
+        )
+        labels = 'guide axis x', 'guide axis z'
+    else:
+        draw_section(axes, shown, legend, np.concatenate([line, tip]))
+        marks = _draw_needle(axes, plan, line, tip, place, target)
+        labels = 'depth', f'guide axis {name[-1]}'
+        words = f'Section through the line from entry point to target, along {labels[1]}.'
+        normal = np.cross(*plane.axes)
+        off = float(np.abs((shaft.final - plane.origin) @ normal).max())
+        if off >= _VISIBLE:
+            words += f' The needle is projected: it is up to {_mm(off)} mm from this section.'
+    axes.set(xlabel=f'{labels[0]} [mm]', ylabel=f'{labels[1]} [mm]')
+    rows = _add_legend(drawing, legend, shown, marks)
+    below, picture = 0.65 + 0.19 * rows, width * tall / wide
+    height = below + picture + 0.15
+    drawing.set_figheight(height)
+    axes.set_position((left, below / height, width / _WIDTH, picture / height))
+    return Picture(name, words, drawing)
+
+
+def _circle() -> FloatArray:
+    angles = np.linspace(0.0, 2.0 * np.pi, 60)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def _draw_circles(axes: Any, plan: Plan, place: FloatArray) -> list[Any]:
+    """Draw the needle and its clearance in the section across, in mm."""
+    from matplotlib.patches import Circle
+
+    free = plan.radius + plan.clearance
+    return [
+        axes.add_patch(
+            Circle(
+                tuple(1e3 * place), 1e3 * radius, ec='k', path_effects=halo(), zorder=5, **style
+            )
+        )
+        for radius, style in (
+            (plan.radius, {'fc': 'k', 'label': 'needle'}),
+            (free, {'fill': False, 'ls': '--', 'lw': 1.4, 'label': 'free of margins'}),
+        )
+    ]
+
+
+def _draw_needle(
+    axes: Any, plan: Plan, line: FloatArray, tip: FloatArray, place: FloatArray, target: FloatArray
+) -> list[Any]:
+    """Draw the shaft with its true width, the path of the tip, and marks, in mm."""
+    turns = np.gradient(line, axis=0)
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    side = plan.radius * np.stack([-turns[:, 1], turns[:, 0]], axis=1)
+    outline = 1e3 * np.concatenate([line + side, (line - side)[::-1]])
+    marks = axes.fill(
+        *outline.T, fc='k', ec='k', lw=0.6, path_effects=halo(3.0), zorder=4,
+        label='needle at the end',
+    )  # fmt: skip
+    if plan.guide.any():
+        marks += axes.plot(
+            *(1e3 * tip).T, color='k', lw=1.3, ls=':', path_effects=halo(2.6), zorder=3,
+            label='path of the tip',
+        )  # fmt: skip
+        ends = (0.0, 1e3 * plan.length)
+        marks += axes.plot(
+            ends, (0.0, 0.0), color='#444444', lw=0.8, ls='--', zorder=3, label='straight line'
+        )
+    for at, marker, size, label in (
+        ((0.0, 0.0), '|', 12.0, 'entry point'),
+        (1e3 * target, 'x', 9.0, 'target'),
+        (1e3 * place, 'o', 12.0, f'least clearance, {_mm(plan.clearance)} mm'),
+    ):
+        marks += axes.plot(
+            *at, ls='', marker=marker, ms=size, mec='k', mew=2.0, mfc='none', zorder=5,
+            path_effects=halo(4.0), label=label,
+        )  # fmt: skip
+    return marks  # type: ignore[no-any-return]
+
+
+def _add_legend(drawing: Any, legend: Legend, shown: Section, marks: list[Any]) -> int:
+    """Add the legend of a section below it; return its number of rows."""
+    from matplotlib.patches import Patch
+
+    visible = [number for number in np.unique(shown.numbers).tolist() if number >= 0]
+    entries = marks + [
+        Patch(fc=legend.colors[k], ec='#555555', label=_named(legend.structures[k]))
+        for k in visible
+    ]
+    if shown.margin.any():
+        entries.append(
+            Patch(fc='w', ec=MARGIN_COLOR, hatch='/////', label='margin of an obstacle')
+        )
+    longest = max(len(one.get_label()) for one in entries)
+    columns = min(len(entries), max(1, _CHARACTERS // (longest + 8)), 4)
+    added = drawing.legend(
+        handles=entries, loc='lower center', ncols=columns, fontsize=8, frameon=False
+    )
+    _plain(added)
+    return ceil(len(entries) / columns)
+
+
+def _plain(legend: Any) -> None:
+    # Names may contain a dollar sign.
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+
+
+def _named(structure: Structure) -> str:
+    # Labels that begin with an underscore are not shown.
+    name = shorten(structure.name, _LONGEST, placeholder='...').replace('_', ' ')
+    return name if name == structure.role else f'{name} ({structure.role})'
+
+
+def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
+    """Draw the clearance in each step, and the guide."""
+    from matplotlib.figure import Figure
+
+    bent = bool(plan.guide.any())
+    drawing = Figure(figsize=(_WIDTH, 5.2 if bent else 3.2), layout='constrained')
+    rows = drawing.subplots(1 + bent, 1, sharex=True, squeeze=False)[:, 0]
+    depths, values = 1e3 * plan.depths, 1e3 * plan.clearances
+    rows[0].stairs(values[1:], depths, color='#777777', lw=1.0, baseline=None)
+    for k, name in enumerate(dict.fromkeys(shaft.limits)):
+        which = np.array([one == name for one in shaft.limits[1:]])
+        if not which.any():
+            continue
+        color = legend.color(name)
+        rows[0].hlines(values[1:][which], depths[:-1][which], depths[1:][which], color, lw=3.0)
+        middles = 0.5 * (depths[:-1] + depths[1:])[which]
+        rows[0].plot(
+            middles, values[1:][which], ls='', marker=_MARKERS[k % len(_MARKERS)], color=color,
+            label=f'limited by {name}' if name else 'beyond 30 mm',
+        )  # fmt: skip
+    rows[0].axhline(values.min(), color='k', lw=0.8, ls='--')
+    rows[0].set(ylim=(0.0, 1.25 * values[1:].max()), ylabel='clearance [mm]')
+    _plain(rows[0].legend(fontsize=8))
+    words = 'Least clearance of the shaft in each step, and the structure that limits it; dashed: '
+    words += f'clearance of the plan, {_mm(plan.clearance)} mm.'
+    if bent:
+        for column, (axis, style) in enumerate((('x', '-'), ('z', '--'))):
+            rows[1].stairs(
+                1e3 * plan.guide[:, column], depths, lw=2.0, ls=style, baseline=None,
+                color=('#0072b2', '#d55e00')[column], label=f'guide {axis}',
+            )  # fmt: skip
+        rows[1].axhline(0.0, color='#999999', lw=0.6)
+        rows[1].set(ylabel='guide [mm]')
+        rows[1].legend(fontsize=8)
+        words += ' Below: setpoints of the guide.'
+    rows[-1].set(xlabel='insertion depth [mm]', xlim=(0.0, depths[-1]))
+    return Picture('plan_depth', words, drawing)
