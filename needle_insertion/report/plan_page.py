@@ -56,6 +56,9 @@ class _Shaft(NamedTuple):
 
     final: FloatArray  #: points from outside the skin to the tip at the end [m], shape (k, 3)
     limits: list[str]  #: structure with the least clearance in the step to each depth
+    along: FloatArray  #: position of points in the tissue along the line [m], shape (p,)
+    clearances: FloatArray  #: clearance of these points [m], shape (p,)
+    nearest: list[str]  #: structure that limits it
 
 
 def write_plan_page(plan: Plan, anatomy: Anatomy | Sequence[Anatomy], path: Path | str) -> None:
@@ -208,7 +211,14 @@ def _shaft(plan: Plan, clearance: Clearance) -> _Shaft:
             f'the needle {plan.needle} is not the one of the plan: its tip ends {_mm(off)} mm '
             'from the path'
         )
-    return _Shaft(_points(one, line, -min(_AROUND, steering.free_length)), limits)
+    points = _points(one, line, 0.0)
+    return _Shaft(
+        _points(one, line, -min(_AROUND, steering.free_length)),
+        limits,
+        (points - plan.entry) @ line.axes[1],
+        clearance.at(points),
+        [clearance.structure_at(point) for point in points],
+    )
 
 
 def _points(needle: SteeredNeedle, line: Line, start: float) -> FloatArray:
@@ -251,7 +261,7 @@ def _picture(plan: Plan, legend: Legend, shaft: _Shaft, name: str, shown: Sectio
             words += f' The needle is projected: it is up to {_mm(off)} mm from this section.'
     axes.set(xlabel=f'{labels[0]} [mm]', ylabel=f'{labels[1]} [mm]')
     rows = _add_legend(drawing, legend, shown, marks)
-    below, picture = 0.65 + 0.19 * rows, width * tall / wide
+    below, picture = 0.6 + 0.18 * rows, width * tall / wide
     height = below + picture + 0.15
     drawing.set_figheight(height)
     axes.set_position((left, below / height, width / _WIDTH, picture / height))
@@ -356,23 +366,24 @@ def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
     drawing = Figure(figsize=(_WIDTH, 5.2 if bent else 3.2), layout='constrained')
     rows = drawing.subplots(1 + bent, 1, sharex=True, squeeze=False)[:, 0]
     depths, values = 1e3 * plan.depths, 1e3 * plan.clearances
-    rows[0].stairs(values[1:], depths, color='#777777', lw=1.0, baseline=None)
-    for k, name in enumerate(dict.fromkeys(shaft.limits)):
-        which = np.array([one == name for one in shaft.limits[1:]])
-        if not which.any():
-            continue
-        color = legend.color(name)
-        rows[0].hlines(values[1:][which], depths[:-1][which], depths[1:][which], color, lw=3.0)
-        middles = 0.5 * (depths[:-1] + depths[1:])[which]
+    rows[0].stairs(
+        values[1:], depths, color='k', lw=1.6, baseline=None, label='least of the shaft in a step'
+    )
+    for k, name in enumerate(dict.fromkeys(shaft.nearest)):
+        which = np.array([one == name for one in shaft.nearest])
+        ends = np.where(which, 1e3 * shaft.clearances, np.nan)
         rows[0].plot(
-            middles, values[1:][which], ls='', marker=_MARKERS[k % len(_MARKERS)], color=color,
-            label=f'limited by {name}' if name else 'beyond 30 mm',
+            shaft.along * 1e3, ends, marker=_MARKERS[k % len(_MARKERS)], markevery=12, lw=2.0,
+            color=legend.color(name),
+            label=f'complete needle, limited by {name}' if name else 'beyond 30 mm',
         )  # fmt: skip
-    rows[0].axhline(values.min(), color='k', lw=0.8, ls='--')
-    rows[0].set(ylim=(0.0, 1.25 * values[1:].max()), ylabel='clearance [mm]')
+    rows[0].axhline(1e3 * plan.clearance, color='k', lw=0.8, ls='--')
+    top = max(values[1:].max(), 1e3 * shaft.clearances.max())
+    rows[0].set(ylim=(0.0, 1.1 * top), ylabel='clearance [mm]')
     _plain(rows[0].legend(fontsize=8))
-    words = 'Least clearance of the shaft in each step, and the structure that limits it; dashed: '
-    words += f'clearance of the plan, {_mm(plan.clearance)} mm.'
+    words = 'Least clearance of the shaft in each step of the insertion, and clearance along the '
+    words += 'complete needle with the structure that limits it; dashed: clearance of the plan, '
+    words += f'{_mm(plan.clearance)} mm.'
     if bent:
         for column, (axis, style) in enumerate((('x', '-'), ('z', '--'))):
             rows[1].stairs(
