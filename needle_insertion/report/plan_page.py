@@ -373,8 +373,8 @@ def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
         which = np.array([one == name for one in shaft.nearest])
         ends = np.where(which, 1e3 * shaft.clearances, np.nan)
         rows[0].plot(
-            shaft.along * 1e3, ends, marker=_MARKERS[k % len(_MARKERS)], markevery=12, lw=2.0,
-            color=legend.color(name),
+            1e3 * shaft.along, ends, lw=2.0, color=legend.color(name),
+            marker=_MARKERS[k % len(_MARKERS)], markevery=(int(which.argmax()), 12),
             label=f'complete needle, limited by {name}' if name else 'beyond 30 mm',
         )  # fmt: skip
     rows[0].axhline(1e3 * plan.clearance, color='k', lw=0.8, ls='--')
@@ -394,5 +394,5 @@ def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
         rows[1].set(ylabel='guide [mm]')
         rows[1].legend(fontsize=8)
         words += ' Below: setpoints of the guide.'
-    rows[-1].set(xlabel='insertion depth [mm]', xlim=(0.0, depths[-1]))
+    rows[-1].set(xlabel='depth [mm]', xlim=(0.0, depths[-1]))
     return Picture('plan_depth', words, drawing)
