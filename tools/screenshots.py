@@ -41,11 +41,12 @@ _SCALES: Final = (1.0, 0.8, 0.65, 0.5)
 _COLORS: Final = 64
 
 _BAGS: Final = ROOT / 'bags'
+_LIVER: Final = ROOT / 'examples' / 'liver'
 
 
 @dataclass(frozen=True)
 class ReportPage:
-    """Page of HTML that a command writes: arguments of ``needle``, with ``DIR`` for its folder."""
+    """Page of HTML that a command writes: arguments of ``needle``, with ``DIR`` or ``FILE``."""
 
     name: str
     command: tuple[str, ...]
@@ -69,6 +70,24 @@ REPORTS: Final = (
         'stiffness.html',
     ),
     ReportPage('study', ('study', 'STUDY', '-o', 'DIR'), 'study.html'),
+    ReportPage(
+        'plan',
+        (
+            'plan',
+            str(_LIVER / 'liver.seg.nrrd'),
+            '--labels',
+            str(_LIVER / 'labels.yaml'),
+            '--target',
+            '62mm,12mm,10mm',
+            '--entry',
+            '132mm,37mm,-1mm',
+            '--entry-radius',
+            '3mm',
+            '--page',
+            'FILE',
+        ),
+        'plan.html',
+    ),
     ReportPage('reproduce', ('reproduce', 'all', '-o', 'DIR'), 'reproduce.html'),
 )
 
@@ -181,8 +200,10 @@ def main() -> None:
             if (page.name in chosen or recorded) and not (made / page.name / page.file).is_file():
                 study = Path(scratch, STUDY.name)
                 study.write_text(re.sub(r'samples: \d+', _SAMPLES, STUDY.read_text('utf-8')))
-                places = {'DIR': str(made / page.name), 'STUDY': str(study)}
-                needle(*(places.get(word, word) for word in page.command))
+                folder = made / page.name
+                folder.mkdir(parents=True, exist_ok=True)
+                places = {'DIR': folder, 'FILE': folder / page.file, 'STUDY': study}
+                needle(*(str(places.get(word, word)) for word in page.command))
         asyncio.run(pictures(options.output, made, chosen))
 
 

@@ -77,11 +77,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         common.add_quantity(parser, name, unit, meaning, value)
     common.add_flag(parser, '--straight', 'plan a straight needle only')
     parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='plan to write (.yaml)')
+    parser.add_argument(
+        '--page',
+        type=Path,
+        metavar='FILE.html',
+        help='page to write: sections of the anatomy with the needle, and all numbers; its '
+        'pictures are written to the same folder',
+    )
     common.add_flag(parser, '--json', 'print JSON instead of a table')
 
 
 def run(options: argparse.Namespace) -> int:
     common.check_file(options.output)
+    common.check_file(options.page)
     target = _position('--target', options.target)
     limits = SteeringLimits(
         step_length=options.step,
@@ -113,6 +121,12 @@ def run(options: argparse.Namespace) -> int:
     if options.output is not None:
         write_plan(plan, options.output)
         files.append(options.output)
+    if options.page is not None:
+        with ProgressLine('page', brief=True):
+            from needle_insertion.report.plan_page import write_plan_page
+
+            write_plan_page(plan, anatomies, options.page)
+        files.append(options.page)
     common.print_result(
         document_of(plan, seconds), text_of(plan, seconds), files, as_json=options.json
     )

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import ceil
 from pathlib import Path
-from textwrap import shorten
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
@@ -337,25 +336,27 @@ def _add_legend(drawing: Any, legend: Legend, shown: Section, marks: list[Any]) 
         entries.append(
             Patch(fc='w', ec=MARGIN_COLOR, hatch='/////', label='margin of an obstacle')
         )
+    return _legend(drawing, entries, 'lower center')
+
+
+def _legend(drawing: Any, entries: list[Any], place: str) -> int:
     longest = max(len(one.get_label()) for one in entries)
     columns = min(len(entries), max(1, _CHARACTERS // (longest + 8)), 4)
-    added = drawing.legend(
-        handles=entries, loc='lower center', ncols=columns, fontsize=8, frameon=False
-    )
-    _plain(added)
-    return ceil(len(entries) / columns)
-
-
-def _plain(legend: Any) -> None:
+    added = drawing.legend(handles=entries, loc=place, ncols=columns, fontsize=8, frameon=False)
     # Names may contain a dollar sign.
-    for text in legend.get_texts():
+    for text in added.get_texts():
         text.set_parse_math(False)
+    return ceil(len(entries) / columns)
 
 
 def _named(structure: Structure) -> str:
     # Labels that begin with an underscore are not shown.
-    name = shorten(structure.name, _LONGEST, placeholder='...').replace('_', ' ')
+    name = _short(structure.name).replace('_', ' ')
     return name if name == structure.role else f'{name} ({structure.role})'
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _LONGEST else f'{name[: _LONGEST - 3]}...'
 
 
 def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
@@ -375,12 +376,11 @@ def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
         rows[0].plot(
             1e3 * shaft.along, ends, lw=2.0, color=legend.color(name),
             marker=_MARKERS[k % len(_MARKERS)], markevery=(int(which.argmax()), 12),
-            label=f'complete needle, limited by {name}' if name else 'beyond 30 mm',
+            label=f'complete needle, limited by {_short(name)}' if name else 'beyond 30 mm',
         )  # fmt: skip
     rows[0].axhline(1e3 * plan.clearance, color='k', lw=0.8, ls='--')
     top = max(values[1:].max(), 1e3 * shaft.clearances.max())
     rows[0].set(ylim=(0.0, 1.1 * top), ylabel='clearance [mm]')
-    _plain(rows[0].legend(fontsize=8))
     words = 'Least clearance of the shaft in each step of the insertion, and clearance along the '
     words += 'complete needle with the structure that limits it; dashed: clearance of the plan, '
     words += f'{_mm(plan.clearance)} mm.'
@@ -388,11 +388,13 @@ def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
         for column, (axis, style) in enumerate((('x', '-'), ('z', '--'))):
             rows[1].stairs(
                 1e3 * plan.guide[:, column], depths, lw=2.0, ls=style, baseline=None,
-                color=('#0072b2', '#d55e00')[column], label=f'guide {axis}',
+                color=('k', '#767676')[column], label=f'guide {axis}',
             )  # fmt: skip
         rows[1].axhline(0.0, color='#999999', lw=0.6)
         rows[1].set(ylabel='guide [mm]')
-        rows[1].legend(fontsize=8)
         words += ' Below: setpoints of the guide.'
+    entries = [one for row in rows for one in row.get_legend_handles_labels()[0]]
+    count = _legend(drawing, entries, 'outside upper center')
+    drawing.set_figheight(drawing.get_figheight() + 0.18 * count)
     rows[-1].set(xlabel='depth [mm]', xlim=(0.0, depths[-1]))
     return Picture('plan_depth', words, drawing)

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import permutations, product
+from itertools import combinations, permutations, product
 from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from needle_dynamics import FloatArray
+from needle_insertion.cli import main
 from needle_insertion.report import plan_page
 from needle_insertion.report.section import directions, legend_of, Plane, sample, section
 from needle_planning import Anatomy, find_plan, Plan, read_anatomy, Structure
@@ -46,7 +47,7 @@ def turned(anatomy: Anatomy, order: tuple[int, ...], signs: tuple[int, ...]) -> 
     """Return the same anatomy with its voxels in another order."""
     matrix = anatomy.to_patient[:, [*order, 3]].copy()
     labels = anatomy.labels.transpose(order)
-    for axis in np.flatnonzero(np.array(signs) < 0):
+    for axis in np.flatnonzero(np.array(signs) < 0).tolist():
         matrix[:, 3] += (labels.shape[axis] - 1) * matrix[:, axis]
         matrix[:, axis] *= -1.0
         labels = np.flip(labels, axis)
@@ -194,6 +195,51 @@ def test_needle_is_drawn_where_the_plan_has_it(straight: Plan, anatomy: Anatomy)
             assert (np.mean((image[y, x] < 60).all(axis=1)) > 0.95) == dark
 
 
+@pytest.mark.parametrize('name', ['x', 'bowed structure with a very long name, number 12'])
+def test_labels_do_not_overlap(bowed: Plan, name: str) -> None:
+    """Also those of the legend and the axes, with structures of short and of long names."""
+    images = read_anatomy(*FILES)
+    renamed = [
+        replace(
+            one,
+            structures={
+                label: replace(each, name=f'{name} {each.name}')
+                for label, each in one.structures.items()
+            },
+        )
+        for one in images
+    ]
+    legend = legend_of(renamed, f'{name} {bowed.structure}')
+    planes = plan_page._planes(bowed, legend)
+    corners = np.concatenate([one.corners for one in planes])
+    clearance = Clearance(renamed, corners, radius=bowed.radius)
+    shaft = plan_page._shaft(bowed, clearance)
+    pictures = [
+        plan_page._picture(
+            bowed, legend, shaft, f'plan_{end}',
+            section(renamed, legend, clearance, bowed.radius, one),
+        )
+        for end, one in zip(('x', 'z', 'across'), planes, strict=True)
+    ]  # fmt: skip
+    for picture in [*pictures, plan_page._by_depth(bowed, legend, shaft)]:
+        figure = picture.figure
+        FigureCanvasAgg(figure).draw()
+        shown = [text for axes in figure.axes for text in axes.texts]
+        boxes = [text.get_window_extent() for text in shown]
+        assert all(figure.axes[0].bbox.containsx(box.x0) for box in boxes)
+        legends = [one.get_window_extent() for one in figure.legends]
+        for axes in figure.axes:
+            labels = axes.xaxis.label, axes.yaxis.label
+            boxes += [one.get_window_extent() for one in labels if one.get_text()]
+            assert not any(axes.bbox.overlaps(one) for one in legends)
+        boxes += legends
+        for one, other in combinations(boxes, 2):
+            assert not one.overlaps(other)
+        for box in boxes:
+            assert figure.bbox.x0 <= box.x0 <= box.x1 <= figure.bbox.x1
+            assert figure.bbox.y0 <= box.y0 <= box.y1 <= figure.bbox.y1
+
+
 def test_section_across_is_at_the_least_clearance(bowed: Plan) -> None:
     across = plan_page._planes(bowed, legend_of(read_anatomy(*FILES), bowed.structure))[2]
     normal = np.cross(*across.axes)
@@ -223,6 +269,19 @@ def test_page_has_all_numbers_of_the_plan(bowed: Plan, tmp_path: Path) -> None:
     assert seen.overflow <= 0
     assert len(seen.images) == 4
     assert all(words and width > 0 for words, width in seen.images)
+
+
+def test_command_writes_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the command in its last line; the page is of the plan that is printed."""
+    file = tmp_path / 'plan.html'
+    words = ['plan', str(FILES[0]), '--labels', str(FILES[1]), '--target', '62mm,12mm,10mm']
+    assert main([*words, '--straight', '--resolution', '2mm', '--page', str(file)]) == 0
+    text = capsys.readouterr().out
+    assert text.endswith(f'wrote {file}\n')
+    seen = look_at(file).text
+    assert 'needle plan ' in seen
+    entry = next(line.split()[1:] for line in text.splitlines() if line.startswith('entry '))
+    assert all(one in seen for one in entry)
 
 
 def test_names_are_shown_as_they_are(straight: Plan, anatomy: Anatomy, tmp_path: Path) -> None:

@@ -44,6 +44,7 @@ def test_plan_of_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ((f'--target={TARGET}', '--entry', '0.3,0,0'), 2, 'is too short: the nearest entry'),
         ((f'--target={TARGET}', '--needle', 'none'), 2, 'needle must be one of'),
         ((f'--target={TARGET}', '-o', '/none/plan.yaml'), 2, 'its folder does not exist'),
+        ((f'--target={TARGET}', '--page', '/none/plan.html'), 2, 'its folder does not exist'),
     ],
 )
 def test_invalid_request_is_one_line(
