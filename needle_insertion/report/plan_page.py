@@ -20,12 +20,13 @@ from needle_insertion.report.section import (
     Legend,
     legend_of,
     MARGIN_COLOR,
+    OUTSIDE_COLOR,
     Plane,
     sample,
     Section,
     section,
 )
-from needle_planning.anatomy import Anatomy, ROLES, Structure
+from needle_planning.anatomy import Anatomy, ROLES
 from needle_planning.clearance import Clearance
 from needle_planning.paths import inserted_shape, Line
 from needle_planning.plan import Plan
@@ -40,8 +41,7 @@ _POINTS: Final = 5e-4  #: Distance of the points of the shaft [m].
 _SAME: Final = 2e-4
 _WIDTH: Final = 8.0  #: Width of a picture [inches].
 _VISIBLE: Final = 1e-4  #: Distance from a section that is stated [m].
-#: Characters in the width of a picture, and of the longest name in a legend.
-_CHARACTERS, _LONGEST = 120, 40
+_CHARACTERS: Final = 120  #: Characters in the width of a picture.
 #: Heads of the columns of a plan, and of the structure.
 _HEADS: Final = (
     'depth [mm]', 'guide x [mm]', 'guide z [mm]', 'tip R [mm]', 'tip A [mm]', 'tip S [mm]',
@@ -115,8 +115,8 @@ def write_plan_page(plan: Plan, anatomy: Anatomy | Sequence[Anatomy], path: Path
         step_heads=_HEADS,
         steps=_steps(plan, shaft),
         structures=[
-            (one.name, one.role, _mm(one.margin) if one.role == ROLES[0] else '')
-            for one in legend.structures
+            (one.name, one.role, _mm(one.margin) if one.role == ROLES[0] else '', str(number))
+            for number, one in enumerate(legend.structures, 1)
         ],
     )
 
@@ -329,13 +329,14 @@ def _add_legend(drawing: Any, legend: Legend, shown: Section, marks: list[Any]) 
 
     visible = [number for number in np.unique(shown.numbers).tolist() if number >= 0]
     entries = marks + [
-        Patch(fc=legend.colors[k], ec='#555555', label=_named(legend.structures[k]))
-        for k in visible
+        Patch(fc=legend.colors[k], ec='#555555', label=_named(legend, k)) for k in visible
     ]
     if shown.margin.any():
         entries.append(
             Patch(fc='w', ec=MARGIN_COLOR, hatch='/////', label='margin of an obstacle')
         )
+    if (shown.numbers < -1).any():
+        entries.append(Patch(fc=OUTSIDE_COLOR, ec='#555555', label='outside the image'))
     return _legend(drawing, entries, 'lower center')
 
 
@@ -349,14 +350,10 @@ def _legend(drawing: Any, entries: list[Any], place: str) -> int:
     return ceil(len(entries) / columns)
 
 
-def _named(structure: Structure) -> str:
+def _named(legend: Legend, number: int) -> str:
     # Labels that begin with an underscore are not shown.
-    name = _short(structure.name).replace('_', ' ')
-    return name if name == structure.role else f'{name} ({structure.role})'
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= _LONGEST else f'{name[: _LONGEST - 3]}...'
+    name, role = legend.names[number].replace('_', ' '), legend.structures[number].role
+    return name if name == role else f'{name} ({role})'
 
 
 def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
@@ -372,11 +369,12 @@ def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
     )
     for k, name in enumerate(dict.fromkeys(shaft.nearest)):
         which = np.array([one == name for one in shaft.nearest])
+        color, shown = legend.obstacle(name)
         ends = np.where(which, 1e3 * shaft.clearances, np.nan)
         rows[0].plot(
-            1e3 * shaft.along, ends, lw=2.0, color=legend.color(name),
+            1e3 * shaft.along, ends, lw=2.0, color=color,
             marker=_MARKERS[k % len(_MARKERS)], markevery=(int(which.argmax()), 12),
-            label=f'complete needle, limited by {_short(name)}' if name else 'beyond 30 mm',
+            label=f'complete needle, limited by {shown}' if name else 'beyond 30 mm',
         )  # fmt: skip
     rows[0].axhline(1e3 * plan.clearance, color='k', lw=0.8, ls='--')
     top = max(values[1:].max(), 1e3 * shaft.clearances.max())

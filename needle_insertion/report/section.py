@@ -23,15 +23,17 @@ _COLORS: Final = {
     'obstacle': ('#d55e00', '#0072b2', '#cc79a7', '#e69f00', '#5a4a8a', '#555555'),
     'target': ('#00a878', '#66cdaa'),
     'entry': ('#56b4e9', '#9ad4f5'),
-    'tissue': ('#f3e6d0', '#e2d3c4', '#e8e8d8', '#d8d8d8'),
+    'tissue': ('#f3e6d0', '#e2d3c4', '#e8e8d8', '#d9e2cc'),
 }  # fmt: skip
-_FREE: Final = '#ffffff'  #: color of voxels without a structure, and outside the image
+_FREE: Final = '#ffffff'  #: color of voxels without a structure
+OUTSIDE_COLOR: Final = '#c4c4c4'  #: color outside the image
 MARGIN_COLOR: Final = '#8a2a00'  #: color of the stripes of a margin
 _STRIPES: Final = 7  #: distance of the stripes [pixels]
 _EDGE: Final = 0.55  #: brightness of the outline of a structure
 _FONT: Final = 8.0  #: size of labels [points]
 #: Height of a line, and width of a character, as multiples of the size.
 _LINE, _CHARACTER = 1.5, 0.62
+_LONGEST: Final = 40  #: longest name in a picture [characters]
 _TRIES: Final = 6  #: places that are tried for a label
 _LEAST_SHARE: Final = 0.34  #: least component of a direction that is named
 _BAR: Final = 0.01  #: length of the scale bar [m]
@@ -74,13 +76,14 @@ class Legend:
 
     structures: Sequence[Structure]
     colors: Sequence[str]
+    names: Sequence[str]  #: names in pictures
 
-    def color(self, name: str) -> str:
-        """Return the color of an obstacle, grey without a name."""
-        for one, color in zip(self.structures, self.colors, strict=True):
+    def obstacle(self, name: str) -> tuple[str, str]:
+        """Return the color of an obstacle and its name in pictures, grey and '' without a name."""
+        for one, color, shown in zip(self.structures, self.colors, self.names, strict=True):
             if (one.role, one.name) == (ROLES[0], name):
-                return color
-        return '#767676'
+                return color, shown
+        return '#767676', ''
 
 
 def legend_of(anatomies: Sequence[Anatomy], first: str = '') -> Legend:
@@ -94,7 +97,20 @@ def legend_of(anatomies: Sequence[Anatomy], first: str = '') -> Legend:
         palette = _COLORS[one.role]
         colors.append(palette[used[one.role] % len(palette)])
         used[one.role] += 1
-    return Legend(ordered, colors)
+    return Legend(ordered, colors, _drawable([one.name for one in ordered]))
+
+
+def _drawable(names: Sequence[str]) -> list[str]:
+    """Return names of limited length in characters of the font, else numbers from 1."""
+    from matplotlib.font_manager import findfont, get_font
+
+    font = get_font(findfont('DejaVu Sans'))
+    return [
+        (name if len(name) <= _LONGEST else f'{name[: _LONGEST - 3]}...')
+        if all(font.get_char_index(ord(one)) for one in name)
+        else f'structure {number}'
+        for number, name in enumerate(names, 1)
+    ]
 
 
 def sample(
@@ -161,8 +177,8 @@ def draw_section(axes: Axes, shown: Section, legend: Legend, line: FloatArray) -
     from matplotlib.colors import to_rgb
 
     numbers = shown.numbers
-    palette = np.array([to_rgb(one) for one in (*legend.colors, _FREE)])
-    image = palette[np.maximum(numbers, -1)]
+    # The last ones have the numbers -2 and -1.
+    image = np.array([to_rgb(one) for one in (*legend.colors, OUTSIDE_COLOR, _FREE)])[numbers]
     rows, columns = np.indices(numbers.shape)
     stripes = shown.margin & ((rows + columns) % _STRIPES < 2)
     image[stripes] = to_rgb(MARGIN_COLOR)
@@ -266,7 +282,7 @@ class _Labels:
         for number, box in enumerate(find_objects(np.maximum(self.shown.numbers + 1, 0))):
             if box is None:
                 continue
-            text = legend.structures[number].name
+            text = legend.names[number]
             mask = (self.shown.numbers[box] == number) & ~self.shown.margin[box]
             inner = distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
             first = np.array([left, low]) + pixel * np.array([box[1].start, box[0].start])

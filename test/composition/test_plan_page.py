@@ -29,14 +29,14 @@ RADIUS = 6e-4
 
 
 def small(turn: FloatArray | None = None) -> Anatomy:
-    """Return skin, tissue and a bone with a name that is no formula and no tag."""
+    """Return skin, tissue and a bone; names are not formulas, tags or Latin letters only."""
     labels = np.zeros((60, 52, 80), dtype=np.int16)
     labels[:, :, 5:79], labels[:, :, 78], labels[10:34, :, 50:53] = 3, 1, 2
     return Anatomy(
         labels=labels,
         to_patient=affine([1e-3, 1.1e-3, 1.2e-3], turn, [0.013, -0.021, 0.007]),
         structures={
-            1: Structure(name='skin', role='entry'),
+            1: Structure(name='皮膚', role='entry'),
             2: Structure(name='_bone $<1', role='obstacle', margin=2e-3),
             3: Structure(name='muscle', role='tissue'),
         },
@@ -286,7 +286,11 @@ def test_command_writes_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 def test_names_are_shown_as_they_are(straight: Plan, anatomy: Anatomy, tmp_path: Path) -> None:
     plan_page.write_plan_page(straight, anatomy, tmp_path / 'plan.html')
-    assert '_bone $<1' in look_at(tmp_path / 'plan.html').text
+    seen = look_at(tmp_path / 'plan.html').text
+    assert '_bone $<1' in seen
+    assert '皮膚' in seen
+    # The font of the pictures has no such characters: a number of the table.
+    assert legend_of([anatomy]).names == ['_bone $<1', 'structure 2', 'muscle']
 
 
 def test_plan_that_does_not_fit_is_one_line(
