@@ -21,7 +21,7 @@ _COVERS: Final = ('obstacle', 'target', 'entry', 'tissue')
 #: Colors by role, repeated if a role has more structures (Okabe and Ito; tissue is lighter).
 _COLORS: Final = {
     'obstacle': ('#d55e00', '#0072b2', '#cc79a7', '#e69f00', '#5a4a8a', '#555555'),
-    'target': ('#00a878', '#66cdaa'),
+    'target': ('#f0e442', '#d9e67a'),
     'entry': ('#56b4e9', '#9ad4f5'),
     'tissue': ('#f3e6d0', '#e2d3c4', '#e8e8d8', '#d9e2cc'),
 }  # fmt: skip
