@@ -35,7 +35,7 @@ _AT_ONCE: Final = 256  #: insertions per batch, which are in memory together
 _PARTS: Final = ('needle', 'constants', 'prior', 'law')  #: settings that are mappings or words
 
 #: Variables of the errors of the tip sensor beyond white noise and losses.
-_ERRORS: Final = {
+SENSOR_ERRORS: Final[Mapping[str, Variable]] = {
     item.name: Variable(
         getattr(_EXACT, item.name),
         item.metadata['unit'],
@@ -141,7 +141,7 @@ class SteeringScenario(Scenario):
                 self._prior.noise, 'm', 'standard deviation of a tip measurement', 0.0
             ),
             'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
-            **_ERRORS,
+            **SENSOR_ERRORS,
         }
 
     @cached_property
@@ -231,7 +231,7 @@ class SteeringScenario(Scenario):
         errors = simulation.SteppedTipErrors(
             interval=self._numbers.interval,
             dropout=row['lost'],
-            **{name: row[name] for name in _ERRORS},
+            **{name: row[name] for name in SENSOR_ERRORS},
         )
         sensor = simulation.SteppedTipSensor(plant, row['tip_noise'], errors, truth.seed, rng, rng)
         try:

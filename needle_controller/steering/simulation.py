@@ -75,22 +75,28 @@ class SteeringPlant:
     Simulated needle that is inserted in steps, and its tip in the frame of the sensor.
 
     `step` is the number of its present depth among ``depths`` of the tip measurements [m], shape
-    (n + 1,); ``frame`` as in `GroundTruth`.
+    (n + 1,); ``frame`` as in `GroundTruth`; ``origin`` is the position of the zero of the guide
+    in the frame of the sensor, x and z [m].
     """
 
     def __init__(
-        self, needle: SteeredNeedle, depths: FloatArray, frame: ArrayLike = (0.0, 0.0)
+        self,
+        needle: SteeredNeedle,
+        depths: FloatArray,
+        frame: ArrayLike = (0.0, 0.0),
+        origin: ArrayLike = (0.0, 0.0),
     ) -> None:
         self.needle, self.depths, self.step = needle, depths, 0
         self._roll = needle.roll
         self._frame: list[float] = np.array(frame).tolist()
+        self._origin: list[float] = np.array(origin).tolist()
 
     @property
     def tip(self) -> FloatArray:
         """Position of the tip in the frame of the sensor, x and z [m]."""
         x, depth, z = self.needle.tip.tolist()
-        turn_x, turn_z = self._frame
-        return np.array([x + turn_x * depth, z + turn_z * depth])
+        (turn_x, turn_z), (at_x, at_z) = self._frame, self._origin
+        return np.array([at_x + x + turn_x * depth, at_z + z + turn_z * depth])
 
     @property
     def done(self) -> bool:

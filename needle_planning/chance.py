@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Probability that a planned insertion succeeds, from simulated insertions with uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from math import isfinite, pi
+import os
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final, TypeAlias
+
+from needle_controller.steering.law import DEFAULT_LAW
+from needle_controller.steering.settings import SteeringLimits, SteeringPrior
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.display import Displayed
+from needle_planning.anatomy import Anatomy
+from needle_planning.plan import Plan
+from needle_ros.errors import ParameterError
+from needle_ros.files import DocumentError, read_document
+from needle_ros.process_pool import processes
+from needle_ros.settings import check_whole, is_number
+from needle_study.distribution import from_table
+from needle_study.scenario import check_names, mapping
+from needle_study.study import build_study, Study
+from needle_study.summary import column, Estimate, indices, probability
+import numpy as np
+
+_MOST: Final = 2**20  #: Most insertions.
+_WIDEST: Final = 6e-3  #: Largest entry error for which the tolerance is computed [m].
+_ENTRIES: Final = 1000  #: Most insertions for the tolerance.
+_KEPT: Final = 0.95  #: Probability of success within the tolerated entry error.
+_LARGEST: Final = 2  #: Number of causes of failure.
+_SCENARIO: Final = 'needle_planning.plan_scenario:PlanScenario'
+#: Beginnings of the variables that are zero for the tolerance, or have other distributions.
+_NOT_OF_ENTRY: Final = ('entry_', 'registration_', 'rotation_', 'target_')
+_KEYS: Final = ('population', 'correlations')
+
+
+def _normal(size: float) -> dict[str, list[float]]:
+    """Return a normal distribution that is truncated at four standard deviations."""
+    return {'normal': [0.0, size], 'within': [-4.0 * size, 4.0 * size]}
+
+
+#: Default uncertainty; the meaning of each variable is in docs/howto/plan.md. The noise of path
+#: and sensor is that of `SteeringPrior`.
+POPULATION: Final[Mapping[str, Any]] = {
+    # A stiffness of the tissue that differs by 40 % changes the bending length by 10 %.
+    'bending_length': {'lognormal': [1.0, 0.1], 'within': [0.5, 2.0]},
+    'skin': {'lognormal': [1.0, 0.3], 'within': [0.1, 10.0]},
+    'bevel_x': _normal(0.05),
+    'bevel_z': _normal(0.05),
+    'entry_x': _normal(1e-3),
+    'entry_z': _normal(1e-3),
+    'frame_x': _normal(0.01),
+    'frame_z': _normal(0.01),
+    'tilt_x': _normal(0.005),
+    'tilt_z': _normal(0.005),
+    'registration_x': _normal(5e-4),
+    'registration_y': _normal(5e-4),
+    'registration_z': _normal(5e-4),
+    'rotation_x': _normal(0.003),
+    'rotation_y': _normal(0.003),
+    'rotation_z': _normal(0.003),
+    'target_x': _normal(3e-4),
+    'target_y': _normal(3e-4),
+    'target_z': _normal(3e-4),
+    'slow_noise': 2e-4,
+}
+
+#: Called with the number of insertions that are done, and of all.
+Progress: TypeAlias = Callable[[int, int], object]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Chance(Displayed):
+    """Result of simulated insertions along a plan; probabilities with 95 % intervals."""
+
+    insertions: int  #: number of insertions
+    radius: float  #: largest distance of the tip from the target [m]
+    hit: Estimate  #: probability that the tip ends within the radius
+    clear: Estimate  #: probability that the clearance is positive along the whole needle
+    success: Estimate  #: probability of both
+    #: Variables that explain most of the variance of the success, with their first-order Sobol'
+    #: index; empty for fewer than 200 insertions.
+    causes: tuple[tuple[str, Estimate], ...]
+    #: Largest distance of the guide from its planned position for which the probability of
+    #: success is at least 95 %, with exact registration and a target at rest [m]; at most 6 mm.
+    #: 0 if the probability is lower without this error.
+    entry_tolerance: float
+    values: Mapping[str, FloatArray]  #: variables and metrics of each insertion, shape (n,)
+
+    def columns(self) -> dict[str, FloatArray]:
+        names = 'sample', 'miss', 'clearance', 'tip_r', 'tip_a', 'tip_s'
+        units = '1', *('m',) * 5
+        return {
+            f'{one} [{unit}]': self.values[one] for one, unit in zip(names, units, strict=True)
+        }
+
+    def document(self) -> dict[str, Any]:
+        """Return the result as numbers, in SI units, for files."""
+        each = {'hit': self.hit, 'clear': self.clear, 'success': self.success}
+        return {
+            'insertions': self.insertions,
+            'radius': self.radius,
+            **{name: _numbers(one) for name, one in each.items()},
+            'causes': {name: _numbers(one) for name, one in self.causes},
+            'entry_tolerance': self.entry_tolerance,
+        }
+
+
+def _numbers(estimate: Estimate) -> list[float]:
+    """Return value and interval."""
+    return [estimate.value, estimate.low, estimate.high]
+
+
+def chance_of(
+    plan: Plan,
+    anatomy: Anatomy | Sequence[Anatomy],
+    *,
+    insertions: int = 1000,
+    seed: int = 1,
+    radius: float = 1e-3,
+    population: Mapping[str, Any] | None = None,
+    correlations: Sequence[Any] = (),
+    limits: SteeringLimits | None = None,
+    prior: SteeringPrior | None = None,
+    law: str = DEFAULT_LAW,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Chance:
+    """
+    Insert sampled needles along a plan, steered by a law, and count hits and contacts.
+
+    The guide follows the plan, and the law corrects the deviation of the measured tip from the
+    planned path. Clearance is computed for the whole shaft at all depths.
+
+    Parameters
+    ----------
+    plan : Plan
+        Plan of `find_plan`.
+    anatomy : Anatomy or sequence of Anatomy
+        Images of the plan.
+    insertions : int
+        Number of insertions; as many again, at most 1000, are simulated for the tolerance of the
+        entry point.
+    seed : int
+        Seed; the result does not depend on the number of workers.
+    radius : float
+        Largest distance of the tip from the target for a hit [m].
+    population : mapping, optional
+        Distribution of each variable, as in a study file; the others have their defaults. By
+        default `POPULATION`.
+    correlations : sequence, optional
+        Correlations, as in a study file.
+    limits : SteeringLimits, optional
+        Limits of the guide, those of the plan.
+    prior : SteeringPrior, optional
+        Prior uncertainty of the law.
+    law : str
+        Law that corrects deviations, as for `build_law`.
+    workers : int, optional
+        Number of processes; by default one per core.
+    progress : callable, optional
+        Called with the number of insertions that are done, and of all.
+
+    Returns
+    -------
+    Chance
+        Probabilities, causes of failure, tolerance of the entry point, and all samples.
+
+    Raises
+    ------
+    ParameterError
+        An argument, a variable or a distribution is not valid.
+
+    """
+    check_whole('insertions', insertions, 1, _MOST)
+    count = (os.cpu_count() or 1) if workers is None else workers
+    check_whole('workers', count, 1, _MOST)
+    if not is_number(radius) or not (radius > 0.0 and isfinite(radius)):
+        raise ParameterError(f'radius must be > 0 m, got {radius!r}')
+    # Imported here: it imports Numba.
+    from needle_planning.plan_scenario import write_inputs
+
+    every = [anatomy] if isinstance(anatomy, Anatomy) else list(anatomy)
+    given = dict(POPULATION if population is None else population)
+    entries = {name: one for name, one in given.items() if not name.startswith(_NOT_OF_ENTRY)}
+    entries |= {'entry_radius': {'uniform': [0.0, _WIDEST]}, 'entry_angle': {'uniform': [-pi, pi]}}
+    with TemporaryDirectory(prefix='needle-plan-') as name:
+        folder = Path(name)
+        write_inputs(folder, plan, every)
+        document = {
+            'scenario': _SCENARIO,
+            'seed': seed,
+            'settings': {
+                **asdict(limits or SteeringLimits()),
+                'turns': 0,
+                'folder': name,
+                'radius': float(radius),
+                'law': law,
+                'prior': asdict(prior or SteeringPrior()),
+            },
+        }
+        first = build_study(
+            {**document, 'samples': insertions, 'population': given,
+             'correlations': list(correlations)}
+        )  # fmt: skip
+        named = {one.rows or name for name, one in first.population.items() if name in entries}
+        second = build_study(
+            {
+                **document,
+                'samples': min(insertions, _ENTRIES),
+                'population': entries,
+                'correlations': [one for one in correlations if named.issuperset(one[:2])],
+            }
+        )
+        done, total = 0, first.samples + second.samples
+        done, total = 0, first.samples + second.samples
+
+        def advance(more: int) -> None:
+            nonlocal done
+            done += more
+            if progress is not None:
+                progress(done, total)
+
+        values, by_entry = (
+            _simulated(study, folder / f'study{k}', count, advance)
+            for k, study in enumerate((first, second))
+        )
+    hit, clear, success = (
+        probability([values[one]], first.design) for one in ('hit', 'clear', 'success')
+    )
+    found = indices(values['success'], {one: values[one] for one in first.population}, first)
+    causes = sorted(found.items(), key=lambda item: -item[1].first.value)[:_LARGEST]
+    return Chance(
+        insertions=insertions,
+        radius=float(radius),
+        hit=hit,
+        clear=clear,
+        success=success,
+        causes=tuple((cause, one.first) for cause, one in causes if one.first.value > 0.0),
+        entry_tolerance=_tolerance(by_entry['entry_radius'], by_entry['success']),
+        values=values,
+    )
+
+
+def _simulated(
+    study: Study, folder: Path, workers: int, advance: Callable[[int], object]
+) -> dict[str, FloatArray]:
+    """Simulate a study in worker processes; return its columns."""
+    # Imported here: it needs an optional package.
+    from needle_study import engine
+
+    results = engine.Results(folder, study)
+    engine.compute(results, partial(processes, workers), workers, advance)
+    names = 'sample', *study.population, *study.scenario.metrics
+    return {name: column(results.table, name) for name in names}
+
+
+def _tolerance(radii: FloatArray, success: FloatArray) -> float:
+    """Return the radius up to which a decreasing probability is at least 95 % [m]."""
+    order = np.argsort(radii, kind='stable')
+    # The last maximum of these sums is where the isotonic regression falls below the limit.
+    sums = np.append(0.0, np.cumsum(success[order] - _KEPT))
+    kept = len(radii) - int(np.argmax(sums[::-1]))
+    return _WIDEST if kept == len(radii) else float(radii[order][kept - 1]) if kept else 0.0
+
+
+def read_population(path: Path | str) -> tuple[dict[str, Any], list[Any]]:
+    """
+    Read the uncertainty of an insertion from a file.
+
+    Parameters
+    ----------
+    path : Path or str
+        File in YAML with the keys ``population`` and ``correlations`` of a study file; its tables
+        are relative to its folder.
+
+    Returns
+    -------
+    population : dict
+        Distribution of each variable.
+    correlations : list
+        Correlations; ParameterError if the file is not readable or has other keys.
+
+    """
+    path = Path(path)
+    try:
+        document = mapping('a population', read_document(path.read_text(encoding='utf-8')))
+        check_names('', document, _KEYS)
+        given = mapping('population', document.get('population'))
+        if not given:
+            raise ParameterError('population must have a variable')
+        found = {
+            str(name): from_table(f'population: {name}', one, path.parent)
+            for name, one in given.items()
+        }
+        correlations = document.get('correlations') or []
+        if not isinstance(correlations, list):
+            raise ParameterError(f'correlations must be a list, got {correlations!r}')
+    except (DocumentError, ParameterError) as error:
+        raise ParameterError(f'{path}: {error}') from error
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else 'it is not text'
+        raise ParameterError(f'{path}: {reason}') from error
+    return found, correlations

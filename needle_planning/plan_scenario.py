@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Scenario of a study: insert sampled needles along a plan, in a patient that differs from the image.
+
+The sensor reports the tip in the frame of the plan: its origin is the planned entry point, its
+axes are those of the guide. The true guide deviates from this frame by the error of the entry
+pose, and the true anatomy by the error of the registration. The law receives the deviation of the
+tip from the planned path, and adds its setpoint to that of the plan: the needle is linear in both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from functools import cached_property
+from math import ceil, cos, hypot, inf, pi, sin
+from pathlib import Path
+from typing import Any, Final
+
+from needle_controller.steering.law import (
+    build_law,
+    DEFAULT_LAW,
+    find_law,
+    GuideSetpoint,
+    SteeringFaultError,
+)
+from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.settings import SteeringLimits, SteeringPrior
+from needle_controller.steering.simulation import (
+    simulate_steering,
+    SteeringPlant,
+    SteppedTipErrors,
+    SteppedTipSensor,
+)
+from needle_dynamics.arrays import FloatArray
+from needle_dynamics.needles import find_needle
+from needle_dynamics.steering.needle import SteeredNeedle
+from needle_dynamics.steering.parameters import with_lengths
+from needle_planning.anatomy import Anatomy, Structure
+from needle_planning.certificate import _least_clearances
+from needle_planning.clearance import Clearance
+from needle_planning.paths import inserted_shape, Line
+from needle_planning.plan import Plan, read_plan, write_plan
+from needle_ros.errors import ParameterError
+from needle_ros.settings import from_values
+from needle_study import scenario
+from needle_study.scenario import MeasuredRun, Metric, Row, Scenario, Streams, Variable
+from needle_study.steering import SENSOR_ERRORS
+import numpy as np
+
+_PLAN: Final = 'plan.yaml'
+_SEEDS: Final = 2**63  #: Upper bound of the seeds of paths.
+#: Largest distance of the points of the shaft, and of the depths [m]. Between them the shaft
+#: deviates from a bilinear surface by 1 um.
+_SPACING: Final = 5e-3
+_TIGHT: Final = 5e-5  #: Largest difference between the bound and the true clearance [m].
+_BEYOND: Final = 0.02  #: Distance from the line within which the clearance is exact [m].
+_LEFT: Final = 0.25  #: Least part of the limits of the guide that is left to the law.
+_PARTS: Final = ('folder', 'radius', 'law', 'prior')
+
+METRICS: Final[Mapping[str, Metric]] = {
+    'success': Metric('', 'the tip ends within the radius, and the clearance is positive'),
+    'hit': Metric('', 'the tip ends within the radius of the target'),
+    'clear': Metric('', 'the clearance of the whole needle is positive at every depth'),
+    'miss': Metric('m', 'distance of the tip from the target at the end'),
+    'clearance': Metric('m', 'least clearance of the shaft at all depths, a lower bound'),
+    'tip_r': Metric('m', 'final position of the tip in the image'),
+    'tip_a': Metric('m', 'final position of the tip in the image'),
+    'tip_s': Metric('m', 'final position of the tip in the image'),
+    'stopped': Metric('', 'the law stopped the insertion before the target depth'),
+}
+
+
+def write_inputs(folder: Path, plan: Plan, anatomies: Sequence[Anatomy]) -> None:
+    """Write the plan and the obstacles of its anatomies for the setting ``folder``."""
+    write_plan(plan, folder / _PLAN)
+    for k, anatomy in enumerate(anatomies):
+        found = [(n, one) for n, one in anatomy.structures.items() if one.role == 'obstacle']
+        np.save(folder / f'labels{k}.npy', anatomy.labels)
+        np.savez(
+            folder / f'anatomy{k}.npz',
+            to_patient=anatomy.to_patient,
+            labels=np.array([n for n, _ in found], dtype=np.int64),
+            margins=np.array([one.margin for _, one in found]),
+        )
+
+
+def _read_anatomies(folder: Path) -> list[Anatomy]:
+    found = []
+    for k in range(len(list(folder.glob('anatomy*.npz')))):
+        with np.load(folder / f'anatomy{k}.npz') as file:
+            structures = {
+                int(label): Structure(name=str(label), role='obstacle', margin=float(margin))
+                for label, margin in zip(file['labels'], file['margins'], strict=True)
+            }
+            matrix = file['to_patient']
+        # Pages of the file are shared by all workers, and only those around the plan are read.
+        labels = np.load(folder / f'labels{k}.npy', mmap_mode='r')
+        found.append(Anatomy(labels=labels, to_patient=matrix, structures=structures))
+    return found
+
+
+class PlanScenario(Scenario):
+    """
+    Insert needles along a plan, steered by a law, and measure tip error and clearance.
+
+    `settings` holds ``folder``, written by `write_inputs`; ``radius`` of a hit [m]; ``law``, as
+    for `build_law`; ``prior``, its fields of `SteeringPrior`; and the fields of `SteeringLimits`.
+    """
+
+    metrics, at_once = METRICS, 1
+
+    def __init__(self, settings: Mapping[str, Any]) -> None:
+        names = [item.name for item in fields(SteeringLimits)]
+        scenario.check_names('settings: ', settings, [*_PARTS, *names])
+        given = {name: value for name, value in settings.items() if name in names}
+        self._limits = limits = from_values(SteeringLimits, given, 'settings.')
+        self._radius = float(settings['radius'])
+        self._law = str(settings.get('law', DEFAULT_LAW))
+        find_law(self._law)
+        prior = scenario.mapping('settings: prior', settings.get('prior'))
+        self._prior = from_values(SteeringPrior, prior, 'settings.prior.')
+        folder = Path(settings['folder'])
+        self._plan = plan = read_plan(folder / _PLAN)
+        self._needle, self._steering, _ = find_needle(plan.needle)
+        self._line = Line(plan.entry, plan.axes)
+        self._planned = (plan.path - plan.entry) @ plan.axes[[0, 2]].T
+        self._clearance = Clearance(
+            _read_anatomies(folder),
+            np.vstack([plan.entry, plan.path]),
+            radius=plan.radius,
+            beyond=_BEYOND + limits.guide_limit,
+        )
+        # The law may use what the plan leaves of the limits.
+        travel = np.abs(np.diff(plan.guide, axis=0, prepend=0.0)).max()
+        limit, step = limits.guide_limit, limits.guide_step
+        self._law_limits = replace(
+            limits,
+            guide_limit=max(limit - float(np.abs(plan.guide).max()), _LEFT * limit),
+            guide_step=inf if step == inf else max(step - float(travel), _LEFT * step),
+            turns=0,
+        )
+        of_prior, bevel = self._prior, 'load of the bevel beyond the nominal one'
+        self.variables: Mapping[str, Variable] = {
+            'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
+            'skin': Variable(
+                1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3
+            ),
+            'bevel_x': Variable(0.0, 'N', bevel, -1e3, 1e3),
+            'bevel_z': Variable(0.0, 'N', bevel, -1e3, 1e3),
+            'path_noise': Variable(
+                of_prior.path_noise, 'rad^2/m', 'variance of the direction of the path', 0.0
+            ),
+            'entry_x': Variable(0.0, 'm', 'position error of the guide', -1.0, 1.0),
+            'entry_z': Variable(0.0, 'm', 'position error of the guide', -1.0, 1.0),
+            'entry_radius': Variable(0.0, 'm', 'further position error of the guide', 0.0, 1.0),
+            'entry_angle': Variable(0.0, 'rad', 'its direction, from x to z', -2 * pi, 2 * pi),
+            'frame_x': Variable(0.0, 'rad', 'error of the insertion direction', -0.5, 0.5),
+            'frame_z': Variable(0.0, 'rad', 'error of the insertion direction', -0.5, 0.5),
+            'tilt_x': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+            'tilt_z': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+            **{
+                f'registration_{axis}': Variable(
+                    0.0, 'm', 'displacement of the patient against the image', -1.0, 1.0
+                )
+                for axis in 'xyz'
+            },
+            **{
+                f'rotation_{axis}': Variable(
+                    0.0, 'rad', 'rotation of the patient about the entry point', -0.5, 0.5
+                )
+                for axis in 'xyz'
+            },
+            **{
+                f'target_{axis}': Variable(
+                    0.0, 'm', 'motion of the target in the patient', -1.0, 1.0
+                )
+                for axis in 'xyz'
+            },
+            'tip_noise': Variable(
+                of_prior.noise, 'm', 'standard deviation of a tip measurement', 0.0
+            ),
+            'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
+            **SENSOR_ERRORS,
+        }  # fmt: skip
+
+    @cached_property
+    def _model(self) -> SteeringModel:
+        # Of deviations from the plan, which contains the nominal bevel.
+        plain = replace(self._steering, bevel_load=(0.0,))
+        return SteeringModel(self._needle, plain, self._plan.depths, self._prior)
+
+    def insert(self, rows: Sequence[Row], streams: Streams) -> Iterator[dict[str, float]]:
+        for row, rng in zip(rows, streams, strict=True):
+            yield self._inserted(row, rng)[0]
+
+    def replay(
+        self,
+        sample: Row,  # noqa: ARG002
+        rng: np.random.Generator,  # noqa: ARG002
+    ) -> Iterator[MeasuredRun]:
+        raise ParameterError('insertions along a plan are not recorded')
+
+    def _inserted(self, row: Row, rng: np.random.Generator) -> tuple[dict[str, float], FloatArray]:
+        """Return the metrics of an insertion, and the shafts in the image, shape (n, k, 3)."""
+        seed = int(rng.integers(_SEEDS))
+        plant = self._plant(row, seed)
+        errors = SteppedTipErrors(
+            dropout=row['lost'], **{name: row[name] for name in SENSOR_ERRORS}
+        )
+        sensor = SteppedTipSensor(plant, row['tip_noise'], errors, seed, rng, rng)
+
+        def deviation(tip: FloatArray) -> FloatArray | None:
+            measured = sensor(tip)
+            return None if measured is None else measured - self._planned[plant.step]
+
+        law = build_law(self._law, self._model, (0.0, 0.0), self._law_limits)
+        stopped = False
+        try:
+            simulate_steering(law, plant, deviation)
+        except SteeringFaultError:
+            stopped = True
+        shafts = self._in_image(row, np.stack(plant.shafts))
+        least, _ = _least_clearances(
+            self._clearance, shafts, np.zeros((len(shafts) - 1, 1), dtype=np.int64), 1, _TIGHT
+        )
+        clearance, tip = float(least[0]) - plant.sag, shafts[-1, -1]
+        motion = np.array([row[f'target_{axis}'] for axis in 'xyz']) @ self._line.axes
+        miss = float(np.linalg.norm(tip - self._plan.target - motion))
+        hit, clear = not stopped and miss <= self._radius, clearance > 0.0
+        metrics = {
+            'success': hit and clear, 'hit': hit, 'clear': clear, 'miss': miss,
+            'clearance': clearance, 'tip_r': tip[0], 'tip_a': tip[1], 'tip_s': tip[2],
+            'stopped': stopped,
+        }  # fmt: skip
+        return {name: float(value) for name, value in metrics.items()}, shafts
+
+    def _plant(self, row: Row, seed: int) -> _PlannedPlant:
+        lengths = row['bending_length'], row['skin']
+        needle, steering = with_lengths(self._needle, self._steering, *lengths)
+        roll, loads = self._plan.roll, self._steering.bevel_load
+        nominal = max(loads)
+        x = nominal * sin(roll) + row['bevel_x']
+        z = nominal * cos(roll) + row['bevel_z']
+        size = hypot(x, z)
+        # A bevel differs in all layers by the same factor.
+        loads = tuple(size / nominal * one for one in loads) if nominal else (size,)
+        steering = replace(
+            steering,
+            bevel_load=loads,
+            path_noise=row['path_noise'],
+            path_noise_length=self._prior.path_noise_length,
+        )
+        radius, angle = row['entry_radius'], row['entry_angle']
+        origin = row['entry_x'] + radius * cos(angle), row['entry_z'] + radius * sin(angle)
+        one = SteeredNeedle(
+            needle,
+            steering,
+            tilt=(row['tilt_x'], row['tilt_z']),
+            roll=float(np.arctan2(x, z)) if size else roll,
+            seed=seed,
+        )
+        frame = row['frame_x'], row['frame_z']
+        return _PlannedPlant(one, self._plan, self._line, self._limits, frame, origin)
+
+    def _in_image(self, row: Row, points: FloatArray) -> FloatArray:
+        """Return points of the frame of the plan in the image: without errors the same ones."""
+        from scipy.spatial.transform import Rotation
+
+        axes, entry = self._line.axes, self._line.entry
+        shift, turn = (
+            np.array([row[f'{name}_{axis}'] for axis in 'xyz']) @ axes
+            for name in ('registration', 'rotation')
+        )
+        if not (shift.any() or turn.any()):
+            return points
+        matrix = Rotation.from_rotvec(turn).as_matrix()
+        return np.asarray((points - entry - shift) @ matrix + entry)
+
+
+class _PlannedPlant(SteeringPlant):
+    """Plant whose guide follows a plan and a law; it keeps the shapes of the shaft."""
+
+    def __init__(
+        self,
+        needle: SteeredNeedle,
+        plan: Plan,
+        line: Line,
+        limits: SteeringLimits,
+        frame: tuple[float, float],
+        origin: tuple[float, float],
+    ) -> None:
+        super().__init__(needle, plan.depths, frame, origin)
+        self._plan, self._line, self._limits = plan, line, limits
+        self._error = np.array(origin), np.array(frame)
+        self._along = np.linspace(0.0, plan.length, ceil(plan.length / _SPACING) + 1)
+        self.shafts: list[FloatArray] = []  #: points of the shaft, shape (k, 3) [m] each
+        self.sag = 0.0  #: largest distance of the shaft from the lines between its points [m]
+        self._keep()
+
+    def _keep(self) -> None:
+        # Points ahead of the tip are at the tip.
+        points = np.minimum(self._along, self.needle.depth)
+        deflections, slopes = inserted_shape(self.needle, points)
+        turns = np.diff(slopes[self._along <= points[-1]], axis=0)
+        spacing = float(self._along[1])
+        self.sag = max(self.sag, spacing / 8.0 * float(np.hypot(*turns.T).max(initial=0.0)))
+        origin, frame = self._error
+        deflections = deflections + origin + points[:, np.newaxis] * frame
+        self.shafts.append(self._line.points(points, deflections))
+
+    def guide(self, to: GuideSetpoint) -> None:
+        now, most, change = self.needle.guide, self._limits.guide_limit, self._limits.guide_step
+        wanted = self._plan.guide[self.step] + to[:2]
+        x, z = np.clip(np.clip(wanted, now - change, now + change), -most, most).tolist()
+        super().guide(GuideSetpoint(x, z, to.roll))
+        self._keep()
+
+    def insert(self) -> None:
+        begin, end = self.depths[self.step], self.depths[self.step + 1]
+        for depth in np.linspace(begin, end, ceil((end - begin) / _SPACING) + 1)[1:-1].tolist():
+            self.needle.move(depth=depth)
+            self._keep()
+        super().insert()
+        self._keep()
