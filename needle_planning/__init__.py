@@ -10,6 +10,9 @@ if TYPE_CHECKING:
     from needle_planning.anatomy import ROLES as ROLES
     from needle_planning.anatomy import SegmentationError as SegmentationError
     from needle_planning.anatomy import Structure as Structure
+    from needle_planning.chance import Chance as Chance
+    from needle_planning.chance import chance_of as chance_of
+    from needle_planning.chance import read_population as read_population
     from needle_planning.labels import read_anatomy as read_anatomy
     from needle_planning.plan import Plan as Plan
     from needle_planning.plan import read_plan as read_plan

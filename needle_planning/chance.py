@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
-from functools import partial
 from math import isfinite, pi
 import os
 from pathlib import Path
@@ -18,22 +18,33 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.display import Displayed
 from needle_planning.anatomy import Anatomy
 from needle_planning.plan import Plan
-from needle_ros.errors import ParameterError
+from needle_ros.errors import missing_extra, ParameterError
 from needle_ros.files import DocumentError, read_document
 from needle_ros.process_pool import processes
 from needle_ros.settings import check_whole, is_number
 from needle_study.distribution import from_table
 from needle_study.scenario import check_names, mapping
 from needle_study.study import build_study, Study
-from needle_study.summary import column, Estimate, indices, probability
+from needle_study.summary import column, Estimate, indices, NOISE, probability
 import numpy as np
 
 _MOST: Final = 2**20  #: Most insertions.
 _WIDEST: Final = 6e-3  #: Largest entry error for which the tolerance is computed [m].
-_ENTRIES: Final = 1000  #: Most insertions for the tolerance.
+_MOST_MORE: Final = 1000  #: Most insertions for the tolerance, and for the causes.
 _KEPT: Final = 0.95  #: Probability of success within the tolerated entry error.
 _LARGEST: Final = 2  #: Number of causes of failure.
+_ROWS: Final = 1024  #: Most sampled values of each cause.
 _SCENARIO: Final = 'needle_planning.plan_scenario:PlanScenario'
+#: Causes of failure, and the beginnings of their variables; all others are of the sensor.
+CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
+    'needle and tissue': ('bending_length', 'skin', 'bevel_', 'path_noise'),
+    'entry pose': ('entry_', 'frame_', 'tilt_'),
+    'registration': ('registration_', 'rotation_'),
+    'target motion': ('target_',),
+    'sensor': ('',),
+}
+_NOISE: Final = 'noise of path and sensor'
+
 #: Beginnings of the variables that are zero for the tolerance, or have other distributions.
 _NOT_OF_ENTRY: Final = ('entry_', 'registration_', 'rotation_', 'target_')
 _KEYS: Final = ('population', 'correlations')
@@ -74,7 +85,7 @@ POPULATION: Final[Mapping[str, Any]] = {
 Progress: TypeAlias = Callable[[int, int], object]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Chance(Displayed):
     """Result of simulated insertions along a plan; probabilities with 95 % intervals."""
 
@@ -83,14 +94,21 @@ class Chance(Displayed):
     hit: Estimate  #: probability that the tip ends within the radius
     clear: Estimate  #: probability that the clearance is positive along the whole needle
     success: Estimate  #: probability of both
-    #: Variables that explain most of the variance of the success, with their first-order Sobol'
-    #: index; empty for fewer than 200 insertions.
+    #: The two `CAUSES`, or noise, with the largest first-order Sobol' indices: fractions of the
+    #: variance of the success; empty for fewer than 200 insertions, or without a failure.
     causes: tuple[tuple[str, Estimate], ...]
     #: Largest distance of the guide from its planned position for which the probability of
     #: success is at least 95 %, with exact registration and a target at rest [m]; at most 6 mm.
     #: 0 if the probability is lower without this error.
     entry_tolerance: float
     values: Mapping[str, FloatArray]  #: variables and metrics of each insertion, shape (n,)
+
+    def __repr__(self) -> str:
+        value, low, high, _ = self.success
+        return (
+            f'<Chance: success {value:.1%} ({low:.1%} to {high:.1%}), hit {self.hit.value:.1%}, '
+            f'clear {self.clear.value:.1%}, {self.insertions} insertions>'
+        )
 
     def columns(self) -> dict[str, FloatArray]:
         names = 'sample', 'miss', 'clearance', 'tip_r', 'tip_a', 'tip_s'
@@ -144,8 +162,8 @@ def chance_of(
     anatomy : Anatomy or sequence of Anatomy
         Images of the plan.
     insertions : int
-        Number of insertions; as many again, at most 1000, are simulated for the tolerance of the
-        entry point.
+        Number of insertions; twice as many again, at most 2 times 1000, are simulated for the
+        causes of failure and for the tolerance of the entry point.
     seed : int
         Seed; the result does not depend on the number of workers.
     radius : float
@@ -185,79 +203,106 @@ def chance_of(
     # Imported here: it imports Numba.
     from needle_planning.plan_scenario import write_inputs
 
-    every = [anatomy] if isinstance(anatomy, Anatomy) else list(anatomy)
-    given = dict(POPULATION if population is None else population)
-    entries = {name: one for name, one in given.items() if not name.startswith(_NOT_OF_ENTRY)}
-    entries |= {'entry_radius': {'uniform': [0.0, _WIDEST]}, 'entry_angle': {'uniform': [-pi, pi]}}
-    with TemporaryDirectory(prefix='needle-plan-') as name:
-        folder = Path(name)
-        write_inputs(folder, plan, every)
-        document = {
-            'scenario': _SCENARIO,
-            'seed': seed,
-            'settings': {
-                **asdict(limits or SteeringLimits()),
-                'turns': 0,
-                'folder': name,
-                'radius': float(radius),
-                'law': law,
-                'prior': asdict(prior or SteeringPrior()),
-            },
+    with TemporaryDirectory(prefix='needle-plan-') as folder:
+        write_inputs(Path(folder), plan, [anatomy] if isinstance(anatomy, Anatomy) else anatomy)
+        settings = {
+            **asdict(limits or SteeringLimits()),
+            'turns': 0,
+            'folder': folder,
+            'radius': float(radius),
+            'law': law,
+            'prior': asdict(prior or SteeringPrior()),
         }
-        first = build_study(
-            {**document, 'samples': insertions, 'population': given,
-             'correlations': list(correlations)}
-        )  # fmt: skip
-        named = {one.rows or name for name, one in first.population.items() if name in entries}
-        second = build_study(
-            {
-                **document,
-                'samples': min(insertions, _ENTRIES),
-                'population': entries,
-                'correlations': [one for one in correlations if named.issuperset(one[:2])],
-            }
-        )
-        done, total = 0, first.samples + second.samples
-        done, total = 0, first.samples + second.samples
-
-        def advance(more: int) -> None:
-            nonlocal done
-            done += more
-            if progress is not None:
-                progress(done, total)
-
-        values, by_entry = (
-            _simulated(study, folder / f'study{k}', count, advance)
-            for k, study in enumerate((first, second))
-        )
+        document = {'scenario': _SCENARIO, 'seed': seed, 'settings': settings}
+        given = dict(POPULATION if population is None else population)
+        studies = _studies(document, insertions, given, list(correlations))
+        values, by_entry, by_cause = _simulated(studies, Path(folder), count, progress)
+    first, _, groups = studies
     hit, clear, success = (
         probability([values[one]], first.design) for one in ('hit', 'clear', 'success')
     )
-    found = indices(values['success'], {one: values[one] for one in first.population}, first)
-    causes = sorted(found.items(), key=lambda item: -item[1].first.value)[:_LARGEST]
     return Chance(
         insertions=insertions,
         radius=float(radius),
         hit=hit,
         clear=clear,
         success=success,
-        causes=tuple((cause, one.first) for cause, one in causes if one.first.value > 0.0),
+        causes=_largest(by_cause['success'], groups),
         entry_tolerance=_tolerance(by_entry['entry_radius'], by_entry['success']),
         values=values,
     )
 
 
-def _simulated(
-    study: Study, folder: Path, workers: int, advance: Callable[[int], object]
-) -> dict[str, FloatArray]:
-    """Simulate a study in worker processes; return its columns."""
-    # Imported here: it needs an optional package.
-    from needle_study import engine
+def _studies(
+    document: Mapping[str, Any], insertions: int, given: Mapping[str, Any], pairs: list[Any]
+) -> tuple[Study, Study, Study]:
+    """Return the studies of a population, of the tolerance of the entry point, and of causes."""
+    every = {'population': given, 'correlations': pairs, 'samples': insertions}
+    study = build_study({**document, **every})
+    entries = {name: one for name, one in given.items() if not name.startswith(_NOT_OF_ENTRY)}
+    entries |= {'entry_radius': {'uniform': [0.0, _WIDEST]}, 'entry_angle': {'uniform': [-pi, pi]}}
+    names = {one.rows or name for name, one in study.population.items() if name in entries}
+    some = {
+        'population': entries,
+        'correlations': [one for one in pairs if names.issuperset(one[:2])],
+        'samples': min(insertions, _MOST_MORE),
+    }
+    groups = {
+        'population': _tables(study),
+        'design': 'saltelli',
+        'samples': min(insertions, _MOST_MORE),
+    }
+    return study, build_study({**document, **some}), build_study({**document, **groups})
 
-    results = engine.Results(folder, study)
-    engine.compute(results, partial(processes, workers), workers, advance)
-    names = 'sample', *study.population, *study.scenario.metrics
-    return {name: column(results.table, name) for name in names}
+
+def _tables(study: Study) -> dict[str, Any]:
+    """Return sampled values of a population in a table for each cause, which is one dimension."""
+    drawn = study.draw(range(min(study.samples, _ROWS)))
+    causes = {
+        name: next(one for one, begins in CAUSES.items() if name.startswith(begins))
+        for name in drawn
+    }
+    varying = {causes[name] for name, values in drawn.items() if np.ptp(values) > 0.0}
+    # Constants need no dimension of their own.
+    some = min(varying, default='sensor')
+    return {
+        name: {'rows': values.tolist(), 'of': causes[name] if causes[name] in varying else some}
+        for name, values in drawn.items()
+    }
+
+
+def _largest(success: FloatArray, study: Study) -> tuple[tuple[str, Estimate], ...]:
+    if success.all():
+        return ()
+    found = indices(success, {}, study)
+    firsts = {_NOISE if name == NOISE else name: one.first for name, one in found.items()}
+    largest = sorted(firsts.items(), key=lambda item: -item[1].value)
+    return tuple(largest[:_LARGEST])
+
+
+def _simulated(
+    studies: Sequence[Study], folder: Path, workers: int, progress: Progress | None
+) -> list[dict[str, FloatArray]]:
+    """Simulate studies in the same worker processes; return the columns of each."""
+    try:
+        from needle_study import engine
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, 'the simulation of insertions', 'study') from error
+    done, total, found = 0, sum(study.samples for study in studies), []
+
+    def advance(more: int) -> None:
+        nonlocal done
+        done += more
+        if progress is not None:
+            progress(done, total)
+
+    with processes(workers) as pool:
+        for k, study in enumerate(studies):
+            results = engine.Results(folder / f'study{k}', study)
+            engine.compute(results, lambda: nullcontext(pool), workers, advance)
+            names = 'sample', *study.population, *study.scenario.metrics
+            found.append({name: column(results.table, name) for name in names})
+    return found
 
 
 def _tolerance(radii: FloatArray, success: FloatArray) -> float:

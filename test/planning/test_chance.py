@@ -157,6 +157,25 @@ def test_probability_holds_with_other_random_numbers(tmp_path: Path, straight: P
     assert stated.success.value < 1.0
 
 
+@pytest.mark.parametrize(
+    ('population', 'cause'),
+    [
+        ({'registration_x': {'normal': [0.0, 1e-3]}, 'entry_z': {'normal': [0.0, 1e-5]}},
+         'registration'),
+        ({'slow_noise': 1.5e-3, 'entry_z': {'normal': [0.0, 1e-5]}}, 'noise of path and sensor'),
+    ],
+)  # fmt: skip
+def test_only_cause_of_failure_explains_all(
+    straight: Plan, population: dict[str, Any], cause: str
+) -> None:
+    found = chance_of(straight, WIDE, insertions=208, population=NO_ERRORS | population)
+    (name, index), (_, other) = found.causes
+    assert name == cause
+    # The other variable does not cause a failure: equal samples have equal results.
+    assert index.value == pytest.approx(1.0, abs=0.1)
+    assert other.low == 0.0
+
+
 def test_larger_uncertainty_has_no_larger_probability(tmp_path: Path, straight: Plan) -> None:
     """Of a displaced patient, which is not corrected."""
     found = []
