@@ -329,7 +329,7 @@ def read_population(path: Path | str) -> tuple[dict[str, Any], list[Any]]:
     population : dict
         Distribution of each variable.
     correlations : list
-        Correlations; ParameterError if the file is not readable or has other keys.
+        Correlations; ParameterError if the file is not readable or not valid.
 
     """
     path = Path(path)
@@ -346,6 +346,12 @@ def read_population(path: Path | str) -> tuple[dict[str, Any], list[Any]]:
         correlations = document.get('correlations') or []
         if not isinstance(correlations, list):
             raise ParameterError(f'correlations must be a list, got {correlations!r}')
+        # The scenario reads its folder later.
+        settings = {'folder': '', 'radius': 1.0}
+        build_study(
+            {'scenario': _SCENARIO, 'settings': settings, 'population': found,
+             'correlations': correlations}
+        )  # fmt: skip
     except (DocumentError, ParameterError) as error:
         raise ParameterError(f'{path}: {error}') from error
     except (OSError, UnicodeDecodeError) as error:

@@ -15,7 +15,7 @@ from dataclasses import fields, replace
 from functools import cached_property
 from math import ceil, cos, hypot, inf, pi, sin
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from needle_controller.steering.law import (
     build_law,
@@ -34,8 +34,9 @@ from needle_controller.steering.simulation import (
 )
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import find_needle
+from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
-from needle_dynamics.steering.parameters import with_lengths
+from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
 from needle_planning.anatomy import Anatomy, Structure
 from needle_planning.certificate import _least_clearances
 from needle_planning.clearance import Clearance
@@ -100,6 +101,19 @@ def _read_anatomies(folder: Path) -> list[Anatomy]:
     return found
 
 
+class _Inputs(NamedTuple):
+    """Content of the folder of a scenario."""
+
+    plan: Plan
+    tips: FloatArray  #: planned tip at each depth in x and z [m], shape (n + 1, 2)
+    line: Line
+    needle: NeedleParameters
+    steering: SteeringParameters
+    clearance: Clearance
+    model: SteeringModel  #: nominal model of deviations from the plan
+    limits: SteeringLimits  #: limits of the law
+
+
 class PlanScenario(Scenario):
     """
     Insert needles along a plan, steered by a law, and measure tip error and clearance.
@@ -114,32 +128,13 @@ class PlanScenario(Scenario):
         names = [item.name for item in fields(SteeringLimits)]
         scenario.check_names('settings: ', settings, [*_PARTS, *names])
         given = {name: value for name, value in settings.items() if name in names}
-        self._limits = limits = from_values(SteeringLimits, given, 'settings.')
+        self._limits = from_values(SteeringLimits, given, 'settings.')
         self._radius = float(settings['radius'])
         self._law = str(settings.get('law', DEFAULT_LAW))
         find_law(self._law)
         prior = scenario.mapping('settings: prior', settings.get('prior'))
         self._prior = from_values(SteeringPrior, prior, 'settings.prior.')
-        folder = Path(settings['folder'])
-        self._plan = plan = read_plan(folder / _PLAN)
-        self._needle, self._steering, _ = find_needle(plan.needle)
-        self._line = Line(plan.entry, plan.axes)
-        self._planned = (plan.path - plan.entry) @ plan.axes[[0, 2]].T
-        self._clearance = Clearance(
-            _read_anatomies(folder),
-            np.vstack([plan.entry, plan.path]),
-            radius=plan.radius,
-            beyond=_BEYOND + limits.guide_limit,
-        )
-        # The law may use what the plan leaves of the limits.
-        travel = np.abs(np.diff(plan.guide, axis=0, prepend=0.0)).max()
-        limit, step = limits.guide_limit, limits.guide_step
-        self._law_limits = replace(
-            limits,
-            guide_limit=max(limit - float(np.abs(plan.guide).max()), _LEFT * limit),
-            guide_step=inf if step == inf else max(step - float(travel), _LEFT * step),
-            turns=0,
-        )
+        self._folder = Path(settings['folder'])
         of_prior, bevel = self._prior, 'load of the bevel beyond the nominal one'
         self.variables: Mapping[str, Variable] = {
             'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
@@ -185,10 +180,31 @@ class PlanScenario(Scenario):
         }  # fmt: skip
 
     @cached_property
-    def _model(self) -> SteeringModel:
+    def _inputs(self) -> _Inputs:
+        """Files of the folder, which only insertions need."""
+        plan, limits = read_plan(self._folder / _PLAN), self._limits
+        needle, steering, _ = find_needle(plan.needle)
+        clearance = Clearance(
+            _read_anatomies(self._folder),
+            np.vstack([plan.entry, plan.path]),
+            radius=plan.radius,
+            beyond=_BEYOND + limits.guide_limit,
+        )
+        # The law may use what the plan leaves of the limits.
+        travel = np.abs(np.diff(plan.guide, axis=0, prepend=0.0)).max()
+        limit, step = limits.guide_limit, limits.guide_step
+        limits = replace(
+            limits,
+            guide_limit=max(limit - float(np.abs(plan.guide).max()), _LEFT * limit),
+            guide_step=inf if step == inf else max(step - float(travel), _LEFT * step),
+            turns=0,
+        )
         # Of deviations from the plan, which contains the nominal bevel.
-        plain = replace(self._steering, bevel_load=(0.0,))
-        return SteeringModel(self._needle, plain, self._plan.depths, self._prior)
+        plain = replace(steering, bevel_load=(0.0,))
+        model = SteeringModel(needle, plain, plan.depths, self._prior)
+        tips = (plan.path - plan.entry) @ plan.axes[[0, 2]].T
+        line = Line(plan.entry, plan.axes)
+        return _Inputs(plan, tips, line, needle, steering, clearance, model, limits)
 
     def insert(self, rows: Sequence[Row], streams: Streams) -> Iterator[dict[str, float]]:
         for row, rng in zip(rows, streams, strict=True):
@@ -203,7 +219,7 @@ class PlanScenario(Scenario):
 
     def _inserted(self, row: Row, rng: np.random.Generator) -> tuple[dict[str, float], FloatArray]:
         """Return the metrics of an insertion, and the shafts in the image, shape (n, k, 3)."""
-        seed = int(rng.integers(_SEEDS))
+        inputs, seed = self._inputs, int(rng.integers(_SEEDS))
         plant = self._plant(row, seed)
         errors = SteppedTipErrors(
             dropout=row['lost'], **{name: row[name] for name in SENSOR_ERRORS}
@@ -212,9 +228,9 @@ class PlanScenario(Scenario):
 
         def deviation(tip: FloatArray) -> FloatArray | None:
             measured = sensor(tip)
-            return None if measured is None else measured - self._planned[plant.step]
+            return None if measured is None else measured - inputs.tips[plant.step]
 
-        law = build_law(self._law, self._model, (0.0, 0.0), self._law_limits)
+        law = build_law(self._law, inputs.model, (0.0, 0.0), inputs.limits)
         stopped = False
         try:
             simulate_steering(law, plant, deviation)
@@ -222,11 +238,11 @@ class PlanScenario(Scenario):
             stopped = True
         shafts = self._in_image(row, np.stack(plant.shafts))
         least, _ = _least_clearances(
-            self._clearance, shafts, np.zeros((len(shafts) - 1, 1), dtype=np.int64), 1, _TIGHT
+            inputs.clearance, shafts, np.zeros((len(shafts) - 1, 1), dtype=np.int64), 1, _TIGHT
         )
         clearance, tip = float(least[0]) - plant.sag, shafts[-1, -1]
-        motion = np.array([row[f'target_{axis}'] for axis in 'xyz']) @ self._line.axes
-        miss = float(np.linalg.norm(tip - self._plan.target - motion))
+        motion = np.array([row[f'target_{axis}'] for axis in 'xyz']) @ inputs.line.axes
+        miss = float(np.linalg.norm(tip - inputs.plan.target - motion))
         hit, clear = not stopped and miss <= self._radius, clearance > 0.0
         metrics = {
             'success': hit and clear, 'hit': hit, 'clear': clear, 'miss': miss,
@@ -237,8 +253,9 @@ class PlanScenario(Scenario):
 
     def _plant(self, row: Row, seed: int) -> _PlannedPlant:
         lengths = row['bending_length'], row['skin']
-        needle, steering = with_lengths(self._needle, self._steering, *lengths)
-        roll, loads = self._plan.roll, self._steering.bevel_load
+        inputs = self._inputs
+        needle, steering = with_lengths(inputs.needle, inputs.steering, *lengths)
+        roll, loads = inputs.plan.roll, inputs.steering.bevel_load
         nominal = max(loads)
         x = nominal * sin(roll) + row['bevel_x']
         z = nominal * cos(roll) + row['bevel_z']
@@ -261,13 +278,13 @@ class PlanScenario(Scenario):
             seed=seed,
         )
         frame = row['frame_x'], row['frame_z']
-        return _PlannedPlant(one, self._plan, self._line, self._limits, frame, origin)
+        return _PlannedPlant(one, inputs.plan, inputs.line, self._limits, frame, origin)
 
     def _in_image(self, row: Row, points: FloatArray) -> FloatArray:
         """Return points of the frame of the plan in the image: without errors the same ones."""
         from scipy.spatial.transform import Rotation
 
-        axes, entry = self._line.axes, self._line.entry
+        axes, entry = self._inputs.line.axes, self._inputs.line.entry
         shift, turn = (
             np.array([row[f'{name}_{axis}'] for axis in 'xyz']) @ axes
             for name in ('registration', 'rotation')

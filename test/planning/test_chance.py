@@ -217,6 +217,9 @@ def test_tolerance_is_where_the_isotonic_regression_ends(hits: Sequence[bool]) -
         ('- 1', 'must be names with values'),
         ('population: {entry_x: {table: [none.csv, x]}}', 'none.csv cannot be read'),
         ('{population: {entry_x: 0}, correlations: 3}', 'correlations must be a list'),
+        ('population: {entry_y: 1mm}', 'entry_y'),
+        ('population: {entry_x: {normal: [0]}}', 'normal takes [mean, standard deviation]'),
+        ('{population: {entry_x: 0}, correlations: [[entry_x, skin, 2]]}', 'correlations takes'),
         ('a: [', 'is not YAML'),
     ],
 )
