@@ -113,7 +113,7 @@ def simulate_insertion(
         step = np.searchsorted(depths, along[1:] - 1e-9)[np.newaxis]
     else:
         step = np.array(steps[1:])[:, np.newaxis]
-    least, place = _least_clearances(clearance, surface, step, len(depths), _TIGHT[straight])
+    least, place = least_clearances(clearance, surface, step, len(depths), _TIGHT[straight])
     least = (np.minimum.accumulate(least) if straight else least) - sag
     return SimulatedInsertion(
         path=line.points(depths, np.array(tips)),
@@ -126,7 +126,7 @@ def simulate_insertion(
     )
 
 
-def _least_clearances(
+def least_clearances(
     clearance: Clearance, surface: FloatArray, steps: IntArray, count: int, tight: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the least clearance in each step, shape (count,), and the point of the least one."""

@@ -28,10 +28,12 @@ from needle_study.study import build_study, Study
 from needle_study.summary import column, Estimate, indices, NOISE, probability
 import numpy as np
 
-_MOST: Final = 2**20  #: Most insertions.
+MOST_INSERTIONS: Final = 2**20  #: Most insertions.
 _WIDEST: Final = 6e-3  #: Largest entry error for which the tolerance is computed [m].
-_MOST_MORE: Final = 1000  #: Most insertions for the tolerance, and for the causes.
+_ENTRIES: Final = 1000  #: Most insertions for the tolerance.
 _KEPT: Final = 0.95  #: Probability of success within the tolerated entry error.
+_PART: Final = 16  #: Insertions between two reports of the progress.
+_RESAMPLED: Final = 400  #: Resamples for the interval of the tolerance.
 _LARGEST: Final = 2  #: Number of causes of failure.
 _ROWS: Final = 1024  #: Most sampled values of each cause.
 _SCENARIO: Final = 'needle_planning.plan_scenario:PlanScenario'
@@ -95,12 +97,12 @@ class Chance(Displayed):
     clear: Estimate  #: probability that the clearance is positive along the whole needle
     success: Estimate  #: probability of both
     #: The two `CAUSES`, or noise, with the largest first-order Sobol' indices: fractions of the
-    #: variance of the success; empty for fewer than 200 insertions, or without a failure.
+    #: variance of the success; empty for fewer than 100 insertions, or without a failure.
     causes: tuple[tuple[str, Estimate], ...]
     #: Largest distance of the guide from its planned position for which the probability of
     #: success is at least 95 %, with exact registration and a target at rest [m]; at most 6 mm.
-    #: 0 if the probability is lower without this error.
-    entry_tolerance: float
+    #: 0 if the probability is lower without this error. Its interval is of the bootstrap.
+    entry_tolerance: Estimate
     values: Mapping[str, FloatArray]  #: variables and metrics of each insertion, shape (n,)
 
     def __repr__(self) -> str:
@@ -125,7 +127,7 @@ class Chance(Displayed):
             'radius': self.radius,
             **{name: _numbers(one) for name, one in each.items()},
             'causes': {name: _numbers(one) for name, one in self.causes},
-            'entry_tolerance': self.entry_tolerance,
+            'entry_tolerance': _numbers(self.entry_tolerance),
         }
 
 
@@ -162,8 +164,8 @@ def chance_of(
     anatomy : Anatomy or sequence of Anatomy
         Images of the plan.
     insertions : int
-        Number of insertions; twice as many again, at most 2 times 1000, are simulated for the
-        causes of failure and for the tolerance of the entry point.
+        Number of insertions. Twice as many again are simulated for the causes of failure, and as
+        many, at most 1000, for the tolerance of the entry point.
     seed : int
         Seed; the result does not depend on the number of workers.
     radius : float
@@ -180,7 +182,8 @@ def chance_of(
     law : str
         Law that corrects deviations, as for `build_law`.
     workers : int, optional
-        Number of processes; by default one per core.
+        Number of processes, by default one per core; 1 for this process. Others are spawned: a
+        script needs ``if __name__ == '__main__':``.
     progress : callable, optional
         Called with the number of insertions that are done, and of all.
 
@@ -195,9 +198,9 @@ def chance_of(
         An argument, a variable or a distribution is not valid.
 
     """
-    check_whole('insertions', insertions, 1, _MOST)
+    check_whole('insertions', insertions, 1, MOST_INSERTIONS)
     count = (os.cpu_count() or 1) if workers is None else workers
-    check_whole('workers', count, 1, _MOST)
+    check_whole('workers', count, 1, MOST_INSERTIONS)
     if not is_number(radius) or not (radius > 0.0 and isfinite(radius)):
         raise ParameterError(f'radius must be > 0 m, got {radius!r}')
     # Imported here: it imports Numba.
@@ -217,10 +220,10 @@ def chance_of(
         given = dict(POPULATION if population is None else population)
         studies = _studies(document, insertions, given, list(correlations))
         values, by_entry, by_cause = _simulated(studies, Path(folder), count, progress)
-    first, _, groups = studies
-    hit, clear, success = (
-        probability([values[one]], first.design) for one in ('hit', 'clear', 'success')
-    )
+    groups = studies[-1]
+    # As for independent samples: with so many variables and noise, a Sobol sequence has nearly
+    # their variance, and an estimate of it from 16 sequences is less certain.
+    hit, clear, success = (probability([values[one]]) for one in ('hit', 'clear', 'success'))
     return Chance(
         insertions=insertions,
         radius=float(radius),
@@ -228,7 +231,7 @@ def chance_of(
         clear=clear,
         success=success,
         causes=_largest(by_cause['success'], groups),
-        entry_tolerance=_tolerance(by_entry['entry_radius'], by_entry['success']),
+        entry_tolerance=_estimated(by_entry['entry_radius'], by_entry['success'], seed),
         values=values,
     )
 
@@ -245,13 +248,9 @@ def _studies(
     some = {
         'population': entries,
         'correlations': [one for one in pairs if names.issuperset(one[:2])],
-        'samples': min(insertions, _MOST_MORE),
+        'samples': min(insertions, _ENTRIES),
     }
-    groups = {
-        'population': _tables(study),
-        'design': 'saltelli',
-        'samples': min(insertions, _MOST_MORE),
-    }
+    groups = {'population': _tables(study), 'design': 'saltelli', 'samples': 2 * insertions}
     return study, build_study({**document, **some}), build_study({**document, **groups})
 
 
@@ -283,12 +282,8 @@ def _largest(success: FloatArray, study: Study) -> tuple[tuple[str, Estimate], .
 def _simulated(
     studies: Sequence[Study], folder: Path, workers: int, progress: Progress | None
 ) -> list[dict[str, FloatArray]]:
-    """Simulate studies in the same worker processes; return the columns of each."""
-    try:
-        from needle_study import engine
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, 'the simulation of insertions', 'study') from error
-    done, total, found = 0, sum(study.samples for study in studies), []
+    """Simulate studies, in the same worker processes; return the columns of each."""
+    done, total = 0, sum(study.samples for study in studies)
 
     def advance(more: int) -> None:
         nonlocal done
@@ -296,6 +291,13 @@ def _simulated(
         if progress is not None:
             progress(done, total)
 
+    if workers == 1:
+        return [_in_this_process(study, advance) for study in studies]
+    try:
+        from needle_study import engine
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, 'the simulation of insertions', 'study') from error
+    found = []
     with processes(workers) as pool:
         for k, study in enumerate(studies):
             results = engine.Results(folder / f'study{k}', study)
@@ -303,6 +305,23 @@ def _simulated(
             names = 'sample', *study.population, *study.scenario.metrics
             found.append({name: column(results.table, name) for name in names})
     return found
+
+
+def _in_this_process(study: Study, advance: Callable[[int], object]) -> dict[str, FloatArray]:
+    parts = []
+    for first in range(0, study.samples, _PART):
+        parts.append(study.rows(first, min(_PART, study.samples - first)))
+        advance(len(parts[-1]['sample']))
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _estimated(radii: FloatArray, success: FloatArray, seed: int) -> Estimate:
+    """Estimate the tolerance, with the interval of resampled insertions."""
+    rng, count = np.random.default_rng(seed), len(radii)
+    drawn = (rng.integers(count, size=count) for _ in range(_RESAMPLED))
+    found = [_tolerance(radii[some], success[some]) for some in drawn]
+    low, high = np.quantile(found, [0.025, 0.975]).tolist()
+    return Estimate(_tolerance(radii, success), low, high, count)
 
 
 def _tolerance(radii: FloatArray, success: FloatArray) -> float:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -69,7 +70,7 @@ class Plan(Displayed):
         }
 
 
-def write_plan(plan: Plan, path: Path | str) -> None:
+def write_plan(plan: Plan, path: Path | str, simulation: Mapping[str, Any] | None = None) -> None:
     """
     Write a plan as a YAML file, atomically.
 
@@ -79,14 +80,17 @@ def write_plan(plan: Plan, path: Path | str) -> None:
         Plan.
     path : Path or str
         File; ParameterError if it cannot be written.
+    simulation : mapping, optional
+        Results of simulated insertions, `Chance.document`.
 
     """
+    more = {'simulation': dict(simulation)} if simulation else {}
     values = {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in asdict(plan).items()
     }
     text = yaml.safe_dump(
-        {'plan': _FORMAT, 'frame': 'RAS, SI units', **values},
+        {'plan': _FORMAT, 'frame': 'RAS, SI units', **values, **more},
         default_flow_style=None,
         sort_keys=False,
         width=100,

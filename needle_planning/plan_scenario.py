@@ -38,7 +38,7 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
 from needle_planning.anatomy import Anatomy, Structure
-from needle_planning.certificate import _least_clearances
+from needle_planning.certificate import least_clearances
 from needle_planning.clearance import Clearance
 from needle_planning.paths import inserted_shape, Line
 from needle_planning.plan import Plan, read_plan, write_plan
@@ -237,7 +237,7 @@ class PlanScenario(Scenario):
         except SteeringFaultError:
             stopped = True
         shafts = self._in_image(row, np.stack(plant.shafts))
-        least, _ = _least_clearances(
+        least, _ = least_clearances(
             inputs.clearance, shafts, np.zeros((len(shafts) - 1, 1), dtype=np.int64), 1, _TIGHT
         )
         clearance, tip = float(least[0]) - plant.sag, shafts[-1, -1]

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """`needle plan`: entry point and needle path with the largest clearance in a segmented image."""
 
+from __future__ import annotations
+
 import argparse
+from collections.abc import Callable
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.needles import DEFAULT_NEEDLE
@@ -16,7 +20,12 @@ from needle_planning.plan import Plan, write_plan
 from needle_planning.planner import find_plan
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import quantities
+from needle_ros.settings import check_whole
 import numpy as np
+
+if TYPE_CHECKING:
+    # Takes half a second to import.
+    from needle_planning.chance import Chance
 
 #: Options whose value may begin with a minus sign.
 SIGNED = ('--target', '--entry')
@@ -76,6 +85,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ):  # fmt: skip
         common.add_quantity(parser, name, unit, meaning, value)
     common.add_flag(parser, '--straight', 'plan a straight needle only')
+    parser.add_argument(
+        '--insertions',
+        type=int,
+        default=0,
+        metavar='N',
+        help='simulate N insertions along the plan with uncertain needle, tissue, poses and '
+        'sensor, and print the probability of success, such as 1000 (default 0)',
+    )
+    parser.add_argument(
+        '--population',
+        type=Path,
+        metavar='FILE',
+        help='uncertainty of these insertions, in the format of a study (default: documented)',
+    )
+    common.add_quantity(
+        parser, '--radius', 'm', 'largest distance of the tip from a hit target (default 1mm)',
+        1e-3,
+    )  # fmt: skip
+    parser.add_argument('--seed', type=int, default=1, help='seed of the insertions (default 1)')
     parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='plan to write (.yaml)')
     parser.add_argument(
         '--page',
@@ -97,6 +125,7 @@ def run(options: argparse.Namespace) -> int:
         guide_step=options.guide_step,
         load_limit=options.load_limit,
     )
+    simulate = _simulation(options)
     begin = perf_counter()
     with ProgressLine('plan', brief=True) as show:
         show('reading the segmentation')
@@ -116,10 +145,15 @@ def run(options: argparse.Namespace) -> int:
             resolution=options.resolution,
             progress=show,
         )
-    seconds = perf_counter() - begin
+        seconds = perf_counter() - begin
+
+        def advance(done: int, total: int) -> None:
+            show(f'{done} of {total} insertions', done / total)
+
+        chance = simulate and simulate(plan, anatomies, limits=limits, progress=advance)
     files = []
     if options.output is not None:
-        write_plan(plan, options.output)
+        write_plan(plan, options.output, chance.document() if chance else None)
         files.append(options.output)
     if options.page is not None:
         with ProgressLine('page', brief=True):
@@ -127,10 +161,33 @@ def run(options: argparse.Namespace) -> int:
 
             write_plan_page(plan, anatomies, options.page)
         files.append(options.page)
-    common.print_result(
-        document_of(plan, seconds), text_of(plan, seconds), files, as_json=options.json
-    )
+    document, text = document_of(plan, seconds), text_of(plan, seconds)
+    if chance:
+        document['simulation'] = chance.document()
+        text += f'\n\n{chance_text(chance)}'
+    common.print_result(document, text, files, as_json=options.json)
     return 0
+
+
+def _simulation(options: argparse.Namespace) -> Callable[..., Chance] | None:
+    """Check the options of the simulated insertions; return the function, None for none."""
+    if not options.insertions:
+        if options.population is not None:
+            raise ParameterError('--population is of simulated insertions: add --insertions 1000')
+        return None
+    # Imported here: Sobol sequences take half a second, and the output of studies is optional.
+    from needle_planning.chance import chance_of, MOST_INSERTIONS, read_population
+
+    check_whole('--insertions', options.insertions, 0, MOST_INSERTIONS)
+    check_whole('--seed', options.seed, 0, 2**32)
+    if not options.radius > 0.0:
+        raise ParameterError(f'--radius must be > 0 m, got {options.radius:g} m')
+    given: dict[str, Any] = {}
+    if options.population is not None:
+        given['population'], given['correlations'] = read_population(options.population)
+    return partial(
+        chance_of, insertions=options.insertions, seed=options.seed, radius=options.radius, **given
+    )
 
 
 def _position(name: str, text: str) -> list[float]:
@@ -184,4 +241,27 @@ def text_of(plan: Plan, seconds: float) -> str:
         f'has more than {1e3 * plan.straight_bound:.2f} mm,\n'
         f'no needle within the limits of the guide more than {1e3 * plan.bound:.2f} mm\n\n'
         f'{table(rows, ("", "R [mm]", "A [mm]", "S [mm]"))}'
+    )
+
+
+def chance_text(chance: Chance) -> str:
+    """Return the results of simulated insertions as a table and text."""
+    radius = f'{1e3 * chance.radius:g} mm'
+    rows = [
+        (name, f'{100.0 * one.value:.1f} %', f'{100.0 * one.low:.1f} to {100.0 * one.high:.1f} %')
+        for name, one in (
+            (f'tip within {radius} of the target', chance.hit),
+            ('no contact along the needle', chance.clear),
+            ('both', chance.success),
+        )
+    ]
+    causes = ', '.join(
+        f'{name} ({100.0 * one.value:.0f} %, {100.0 * one.low:.0f} to {100.0 * one.high:.0f} %)'
+        for name, one in chance.causes
+    )
+    tolerance = 1e3 * np.array(chance.entry_tolerance[:3])
+    return (
+        f'{table(rows, (f"{chance.insertions} insertions", "probability", "95 % interval"))}\n\n'
+        f'largest causes of failure, fraction of its variance: {causes or "none found"}\n'
+        'tolerated error of the entry point: {:.1f} mm ({:.1f} to {:.1f} mm)'.format(*tolerance)
     )

@@ -168,7 +168,7 @@ def test_probability_holds_with_other_random_numbers(tmp_path: Path, straight: P
 def test_only_cause_of_failure_explains_all(
     straight: Plan, population: dict[str, Any], cause: str
 ) -> None:
-    found = chance_of(straight, WIDE, insertions=208, population=NO_ERRORS | population)
+    found = chance_of(straight, WIDE, insertions=104, population=NO_ERRORS | population)
     (name, index), (_, other) = found.causes
     assert name == cause
     # The other variable does not cause a failure: equal samples have equal results.
