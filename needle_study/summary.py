@@ -127,8 +127,10 @@ def _size(sums: FloatArray) -> float:
     """Return the number of independent samples with the same interval, by number and sum."""
     n, yes = sums
     count, p = len(n), float(yes.sum() / n.sum())
+    if count == 1:
+        return float(n.sum())
     apart = yes - p * n
-    variance = count / max(1, count - 1) * float(apart @ apart) / float(n.sum()) ** 2
+    variance = count / (count - 1) * float(apart @ apart) / float(n.sum()) ** 2
     if variance == 0.0 or not n.all():
         return float(n.sum())
     # The variance has an error: Student's distribution.

@@ -16,6 +16,7 @@ from needle_planning.chance import _tolerance, chance_of, POPULATION, read_popul
 from needle_planning.plan_scenario import write_inputs
 from needle_ros.errors import ParameterError
 from needle_study.study import build_study
+from needle_study.summary import probability
 import numpy as np
 import pytest
 from scipy.optimize import isotonic_regression
@@ -174,6 +175,18 @@ def test_only_cause_of_failure_explains_all(
     # The other variable does not cause a failure: equal samples have equal results.
     assert index.value == pytest.approx(1.0, abs=0.1)
     assert other.low == 0.0
+
+
+@settings(deadline=None)
+@given(st.integers(1, 20_000), st.floats(0.0, 1.0))
+def test_interval_of_independent_samples_is_that_of_wilson(count: int, part: float) -> None:
+    """Also where the number of samples times their fraction is rounded."""
+    ones = round(part * count)
+    found = probability([np.append(np.ones(ones), np.zeros(count - ones))])
+    z, p = 1.96, ones / count
+    for end in (found.low, found.high):
+        # The score test of an end has its critical value.
+        assert count * (p - end) ** 2 == pytest.approx(z * z * end * (1.0 - end), abs=1e-9)
 
 
 def test_larger_uncertainty_has_no_larger_probability(tmp_path: Path, straight: Plan) -> None:
