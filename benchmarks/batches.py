@@ -193,6 +193,9 @@ def compare(tick: Tick) -> Answer:
         Bar('batches, 2 threads over 1', ratio, 1.8, 'x', at_least=True),
         Bar('batches, memory for 10 times the simulated time', long / short, 1.05, 'x'),
     ]
+    if alike:
+        ratio = times['compiled, ours'] / times['compiled, C']
+        bars.append(Bar('batches, over the same step in C', ratio, 1.3, 'x'))
     return [section, memory], bars
 
 
