@@ -137,10 +137,10 @@ class _Training(VecEnv):
         return [None] * self.num_envs
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise NotImplementedError
+        raise AttributeError(f'{attr_name} cannot be set to {value!r} in {indices or "all"}')
 
     def env_method(self, method_name: str, *_args: Any, **_options: Any) -> list[Any]:
-        raise NotImplementedError
+        raise AttributeError(f'the environments have no method {method_name}')
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:  # noqa: ARG002
         return [False] * self.num_envs

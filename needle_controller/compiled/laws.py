@@ -85,7 +85,7 @@ def learn(
     """
     prior = (0.25 * limits[0] ** 2, 0.25 * limits[1] ** 2, 0.25 * limits[2] ** 2)
     growth = period / _RELEARNED
-    # The covariance is symmetric: its diagonal, and the entries beside it.
+    # The covariance is symmetric: its diagonal, and the entries above it.
     c00 = (block[3] if block[3] > 0.0 else prior[0]) + growth * prior[0]
     c11 = (block[7] if block[7] > 0.0 else prior[1]) + growth * prior[1]
     c22 = (block[11] if block[11] > 0.0 else prior[2]) + growth * prior[2]

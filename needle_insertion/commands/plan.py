@@ -34,8 +34,8 @@ SIGNED = ('--target', '--entry')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         'Find the entry point from which a needle reaches a target with the largest clearance, '
-        'straight or bowed by the guide, and prove that no other one is better by more than a '
-        'resolution. Positions are in patient coordinates, RAS.'
+        'straight or bowed by the guide, and prove that no other straight needle is better by '
+        'more than a resolution. Positions are in patient coordinates, RAS.'
     )
     parser.add_argument(
         'segmentation',
