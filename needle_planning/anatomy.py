@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 #: Roles of a label: never touched; pierced; to reach; where the needle may enter.
 ROLES: Final = ('obstacle', 'tissue', 'target', 'entry')
 
+#: Roles in the order in which structures cover each other.
+COVERS: Final = ('obstacle', 'target', 'entry', 'tissue')
+
 #: Largest cosine between two axes of the voxels: 0.1 mm in 1 m; orientations in files are rounded.
 _PERPENDICULAR: Final = 1e-4
 

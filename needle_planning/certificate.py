@@ -85,9 +85,7 @@ def simulate_insertion(
         points = np.minimum(along, one.depth)
         deflections, slopes = inserted_shape(one, points)
         slope = max(slope, float(np.hypot(*slopes.T).max()))
-        # Between two points the shaft deviates from a straight line.
-        turns = np.diff(slopes[along <= one.depth], axis=0)
-        sag = max(sag, _CHECKED / 8.0 * float(np.hypot(*turns.T).max(initial=0.0)))
+        sag = max(sag, sag_of(slopes[along <= one.depth], _CHECKED))
         shapes.append(line.points(points, deflections))
         steps.append(step)
 
@@ -124,6 +122,12 @@ def simulate_insertion(
         slope=slope,
         load=max(loads),
     )
+
+
+def sag_of(slopes: FloatArray, spacing: float) -> float:
+    """Return the largest deviation of a shaft from the lines between its points [m]."""
+    turns = np.diff(slopes, axis=0)
+    return spacing / 8.0 * float(np.hypot(*turns.T).max(initial=0.0))
 
 
 def least_clearances(

@@ -12,7 +12,7 @@ from reprlib import repr as short
 from typing import Any, Final
 
 from needle_dynamics import FloatArray
-from needle_planning.anatomy import Anatomy, ROLES, SegmentationError, Structure
+from needle_planning.anatomy import Anatomy, COVERS, ROLES, SegmentationError, Structure
 from needle_planning.segmentation import read_layers
 from needle_planning.voxels import LARGEST_VALUE, Layer, MOST_VOXELS, planes, present, SPACES
 from needle_ros.errors import ParameterError, shown
@@ -159,7 +159,7 @@ def _structure(where: str, name: str, given: Any) -> Structure:
 
 def _rank(one: Structure) -> tuple[int, float]:
     """Return the rank of a structure: where structures overlap, the smallest is kept."""
-    return ('obstacle', 'target', 'entry', 'tissue').index(one.role), -one.margin
+    return COVERS.index(one.role), -one.margin
 
 
 def read_anatomy(

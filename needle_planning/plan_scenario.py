@@ -38,7 +38,7 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
 from needle_planning.anatomy import Anatomy, Structure
-from needle_planning.certificate import least_clearances
+from needle_planning.certificate import least_clearances, sag_of
 from needle_planning.clearance import Clearance
 from needle_planning.paths import inserted_shape, Line
 from needle_planning.plan import Plan, read_plan, write_plan
@@ -312,16 +312,15 @@ class _PlannedPlant(SteeringPlant):
         self._error = np.array(origin), np.array(frame)
         self._along = np.linspace(0.0, plan.length, ceil(plan.length / _SPACING) + 1)
         self.shafts: list[FloatArray] = []  #: points of the shaft, shape (k, 3) [m] each
-        self.sag = 0.0  #: largest distance of the shaft from the lines between its points [m]
+        self.sag = 0.0  #: largest `sag_of` the shaft [m]
         self._keep()
 
     def _keep(self) -> None:
         # Points ahead of the tip are at the tip.
         points = np.minimum(self._along, self.needle.depth)
         deflections, slopes = inserted_shape(self.needle, points)
-        turns = np.diff(slopes[self._along <= points[-1]], axis=0)
-        spacing = float(self._along[1])
-        self.sag = max(self.sag, spacing / 8.0 * float(np.hypot(*turns.T).max(initial=0.0)))
+        sag = sag_of(slopes[self._along <= points[-1]], float(self._along[1]))
+        self.sag = max(self.sag, sag)
         origin, frame = self._error
         deflections = deflections + origin + points[:, np.newaxis] * frame
         self.shafts.append(self._line.points(points, deflections))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, TYPE_CHECKING
 
 from needle_dynamics.arrays import FloatArray, IntArray
-from needle_planning.anatomy import Anatomy, ROLES, Structure
+from needle_planning.anatomy import Anatomy, COVERS, ROLES, Structure
 from needle_planning.clearance import Clearance, image_frame
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Order in which structures cover each other, as in `read_anatomy`.
-_COVERS: Final = ('obstacle', 'target', 'entry', 'tissue')
 #: Colors by role, repeated if a role has more structures (Okabe and Ito; tissue is lighter).
 _COLORS: Final = {
     'obstacle': ('#d55e00', '#0072b2', '#cc79a7', '#e69f00', '#5a4a8a', '#555555'),
@@ -89,9 +87,7 @@ class Legend:
 def legend_of(anatomies: Sequence[Anatomy], first: str = '') -> Legend:
     """Return the structures of images, each once, of obstacles `first` first."""
     every = {(s.role, s.name): s for one in anatomies for s in one.structures.values()}
-    ordered = sorted(
-        every.values(), key=lambda s: (_COVERS.index(s.role), s.name != first, s.name)
-    )
+    ordered = sorted(every.values(), key=lambda s: (COVERS.index(s.role), s.name != first, s.name))
     colors, used = [], dict.fromkeys(_COLORS, 0)
     for one in ordered:
         palette = _COLORS[one.role]

@@ -103,6 +103,7 @@ def test_displaced_patient_and_moved_target_are_missed_by_as_much(
     """No sensor measures them: the tip is where the image had the target."""
     for name in ('registration', 'target'):
         (miss,) = inserted(tmp_path, straight, WIDE, NO_ERRORS | {f'{name}_{axis}': 2e-3})['miss']
+        # The simulated guide is good to a nanometer.
         assert miss == pytest.approx(2e-3, abs=1e-6)
 
 
@@ -112,6 +113,7 @@ def test_rotated_patient_is_missed_by_the_chord(
 ) -> None:
     """The rotation is about the entry point; about the needle it does not move the target."""
     (miss,) = inserted(tmp_path, straight, WIDE, NO_ERRORS | {f'rotation_{axis}': 0.02})['miss']
+    # The simulated guide is good to a nanometer.
     assert miss == pytest.approx(2.0 * arm * straight.length * np.sin(0.01), abs=1e-6)
 
 
