@@ -21,13 +21,13 @@ from needle_dynamics import (
     NeedleModel,
     NeedleParameters,
 )
+from needle_dynamics.compiled.lanes import LANES
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.steering.needle import wandering
 from needle_dynamics.steering.parameters import with_lengths
 from needle_ros.errors import ParameterError, ShapeError
 from needle_study.gym.insertion import DRAWN, InsertionEnv, InsertionVectorEnv, SPREAD, TARGETS
 from needle_study.gym.pushed import FORCE, PERIOD, START, STEP
-from needle_study.gym.steered import LANES
 from needle_study.gym.steering import PRIOR, SteeringEnv, SteeringVectorEnv
 import numpy as np
 import pytest
