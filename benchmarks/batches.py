@@ -22,7 +22,7 @@ from benchmarks.step import chains
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, simulate_batch
 from needle_dynamics.compiled import lanes
 from needle_dynamics.compiled.intervals import run
-from needle_dynamics.simulated.batch import Batch, lane_constants, lane_layers, lane_table
+from needle_dynamics.simulated.batch import Batch, lane_constants, lane_layers, lane_modes
 import numpy as np
 
 #: Number of insertions.
@@ -52,7 +52,7 @@ class Batches:
         ]
         self._arrays = (
             lane_constants(self._parameters),
-            lane_table(preset.reach, preset.modes),
+            lane_modes(preset.reach, preset.modes),
             lane_layers(self._parameters),
         )
 
@@ -80,14 +80,14 @@ class Batches:
     def compiled(self, in_c: Run | None) -> FloatArray:
         """Simulate without preparation, in C or by our compiled code; return final states."""
         ends = np.tile(self._start, (len(self._parameters), 1))
-        needles, table, layers = self._arrays
+        needles, modes, layers = self._arrays
         if in_c is not None:
-            in_c(needles, table, FORCE, DURATION, _STEP, ends)
+            in_c(needles, modes.table, FORCE, DURATION, _STEP, ends)
             return ends
         force, torque = np.array([[FORCE]]), np.zeros((1, 1))
         inputs = lanes.BatchTrajectory(force, torque, 1, DURATION, _STEP, True)
-        kept, completed = np.empty((len(ends), 1, lanes.STATE)), np.empty(len(ends))
-        lanes.run(needles, table, layers, inputs, np.arange(len(ends)), ends, kept, completed)
+        kept, completed = np.empty((len(ends), 1, ends.shape[1])), np.empty(len(ends))
+        lanes.run(needles, modes, layers, inputs, np.arange(len(ends)), ends, kept, completed)
         return ends
 
     def one_by_one(self) -> FloatArray:

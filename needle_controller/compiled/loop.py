@@ -21,21 +21,25 @@ from needle_dynamics.arrays import (
 )
 from needle_dynamics.compiled.cache import inlined, kernel
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
-from needle_dynamics.compiled.lanes import (
+from needle_dynamics.compiled.lane_rows import (
     ACCELERATION,
     DEPTH,
     FORCE,
     INSIDE,
-    LANES,
+    LaneModes,
     LEFT,
-    load_lane,
-    ROWS,
-    step_lanes,
-    swap_lanes,
     TIME,
     TIP,
-    tip_lanes,
     VELOCITY,
+)
+from needle_dynamics.compiled.lanes import (
+    empty_lanes,
+    load_lane,
+    rotate_two_lanes,
+    Rotation,
+    step_lanes,
+    swap_lanes,
+    tip_lanes,
 )
 from needle_dynamics.compiled.step import adapted, advance, CompiledNeedle, Inputs
 import numpy as np
@@ -145,10 +149,11 @@ def run_loop(
     return int(count)
 
 
-@kernel
-def run_lanes(
+@inlined
+def run_lanes_with(
+    rotate: Rotation,
     needles: Matrix,
-    table: Matrix,
+    modes: LaneModes,
     layers: Array3,
     law: LawTuple,
     limit: float,
@@ -166,23 +171,23 @@ def run_lanes(
     completed: Vector,
 ) -> None:
     """
-    Run a law with up to `LANES` needles as `run_loop`, several with each instruction.
+    Run a law with up to as many needles as lanes as `run_loop`, several with each instruction.
 
     Arrays are as for `run_loop` with a leading axis of runs, in falling order of the periods
     ``counts``, and long enough for all. ``which`` has the rows of the runs to compute.
-    ``needles``, ``table`` and ``layers`` are as for `lanes.run`. ``delays`` are the periods until
+    ``needles``, ``modes`` and ``layers`` are as for `lanes.run`. ``delays`` are the periods until
     a command acts, before which no force acts, and ``starts`` the initial states. ``motions``,
     shape (runs, 3, k + 1), takes insertion depth, velocity and tip deflection at the
     measurements, ``completed`` the periods.
     """
     n, period = len(which), LawConstants(*law).period
-    w, memory, acts = np.zeros(ROWS * LANES), np.zeros((n, MEMORY)), np.zeros(n)
+    w, memory, acts = empty_lanes(modes), np.zeros((n, MEMORY)), np.zeros(n)
     waited, inside = np.zeros(n, dtype=np.int64), np.ones(n, dtype=np.bool_)
     # Lanes change places; the run of each.
     order = np.arange(n)
     for i in range(n):
-        load_lane(w, i, needles, which[i], starts[which[i]], table)
-    _keep(w, n, table, which, order, inside, motions, 0)
+        load_lane(w, i, needles, which[i], starts[which[i]], modes)
+    _keep(w, n, modes, which, order, inside, motions, 0)
     for k in range(counts[which[0]]):
         for i in range(n - 1, -1, -1):
             if counts[which[order[i]]] <= k:
@@ -207,16 +212,43 @@ def run_lanes(
         # Lanes with a border between layers in this period take more steps.
         m = n
         while m > 0:
-            step_lanes(w, m, table, layers, longest, 0.0)
+            step_lanes(rotate, w, m, modes, layers, longest, 0.0)
             for i in range(m - 1, -1, -1):
                 inside[order[i]] &= w[INSIDE + i] != 0.0
                 if w[LEFT + i] == 0.0:
                     m -= 1
                     _swap(w, order, i, m)
-        _keep(w, n, table, which, order, inside, motions, k + 1)
+        _keep(w, n, modes, which, order, inside, motions, k + 1)
         for i in range(n):
             if inside[order[i]]:
                 completed[which[order[i]]] = k + 1
+
+
+@kernel
+def run_lanes(
+    needles: Matrix,
+    modes: LaneModes,
+    layers: Array3,
+    law: LawTuple,
+    limit: float,
+    setpoints: Array3,
+    goal: Matrix,
+    counts: IntVector,
+    delays: IntVector,
+    known: int,
+    noise: Array3,
+    longest: float,
+    which: IntVector,
+    starts: Matrix,
+    motions: Array3,
+    commands: Matrix,
+    completed: Vector,
+) -> None:
+    """Run `run_lanes_with` for needles with one or two modes."""
+    run_lanes_with(
+        rotate_two_lanes, needles, modes, layers, law, limit, setpoints, goal, counts, delays,
+        known, noise, longest, which, starts, motions, commands, completed,
+    )  # fmt: skip
 
 
 @inlined
@@ -230,7 +262,7 @@ def _swap(w: FloatArray, order: IntArray, i: int, j: int) -> None:
 def _keep(
     w: FloatArray,
     n: int,
-    table: FloatArray,
+    modes: LaneModes,
     which: IntArray,
     order: IntArray,
     inside: BoolArray,
@@ -238,7 +270,7 @@ def _keep(
     k: int,
 ) -> None:
     """Write the motion of each lane that is inside its range."""
-    tip_lanes(w, n, table)
+    tip_lanes(w, n, modes)
     for i in range(n):
         if inside[order[i]]:
             run = which[order[i]]

@@ -10,20 +10,21 @@ from math import isfinite
 from typing import Final, NamedTuple, Protocol
 
 from needle_controller.compiled.loop import run_lanes, run_loop
+from needle_controller.compiled.many_loop import run_many_lanes
 from needle_controller.controller import ControllerOutput, Measurement
 from needle_controller.in_loop.run import LoopRun
 from needle_controller.laws.law import Law
 from needle_controller.reference.path import Trapezoid
 from needle_controller.reference.setpoint import Reference
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
-from needle_dynamics.compiled.lanes import LANES
+from needle_dynamics.compiled.lane_rows import LANES
 from needle_dynamics.display import Progress, progress_of
 from needle_dynamics.simulated.batch import (
     lane_constants,
     lane_groups,
     lane_layers,
+    lane_modes,
     lane_states,
-    lane_table,
     number_of_runs,
     thread_count,
 )
@@ -331,8 +332,9 @@ def run_insertions(
     for reach, some in lane_groups(parameters, runs).items():
         if reach is not None:
             for part in np.split(some, range(LANES, len(some), LANES)):
-                run_lanes(
-                    lane_constants(parameters), lane_table(reach, modes), layers, law.packed,
+                advance = run_many_lanes if modes > 2 else run_lanes
+                advance(
+                    lane_constants(parameters), lane_modes(reach, modes), layers, law.packed,
                     limit, setpoints, goal, counts, delays, delay, blurred, step, part, wide,
                     motions, commands, completed,
                 )  # fmt: skip

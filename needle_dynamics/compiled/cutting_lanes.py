@@ -14,7 +14,7 @@ from needle_dynamics.compiled.beam import cross, Crossing, element
 from needle_dynamics.compiled.cache import compiled, inlined
 from needle_dynamics.compiled.cut import node_after, NOTHING, PART, SHIFT
 from needle_dynamics.compiled.cutting_needle import Cut, Steered
-from needle_dynamics.compiled.lanes import LANES
+from needle_dynamics.compiled.lane_rows import LANES
 
 # Offset of each row of the lanes. Depth of the tip, of the last node and of the node before [m],
 # whether the path restarts at the last node, bending stiffness, sine and cosine of the roll, and

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
-from math import inf
+from math import ceil, inf
 from operator import attrgetter
 import os
 from typing import Final
@@ -13,6 +13,9 @@ from typing import Final
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled import lanes
 from needle_dynamics.compiled.intervals import run
+from needle_dynamics.compiled.lane_rows import COLUMNS, Constants, LaneModes, LAYER, SECOND
+from needle_dynamics.compiled.many_batch import run_many
+from needle_dynamics.compiled.many_lanes import MANY, PIECES, TERMS
 from needle_dynamics.display import Progress, progress_of
 from needle_dynamics.friction import LAW_NUMBERS
 from needle_dynamics.model import NeedleModel, ROUNDING
@@ -22,12 +25,13 @@ from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
 from needle_dynamics.simulated.trajectory import checked_tolerance, count_of, floats, refined
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
 
 _CHUNK: Final = 256  #: largest number of runs per task, enough to fill all vector lanes
 
 #: Constants of the lanes that are attributes of `NeedleParameters`; read after the first three.
-_OWN: Final = [one for one in lanes.Constants._fields if hasattr(NeedleParameters, one)]
+_OWN: Final = [one for one in Constants._fields if hasattr(NeedleParameters, one)]
 _ONE_MODE: Final = [0, 1, 2, 4, 5, 6]  #: entries of a state in the lanes for a single mode
 _READ: Final = attrgetter('minimum_depth', 'reach', 'hub_stop', *_OWN)
 
@@ -233,8 +237,9 @@ def _take(
                     kept[i, : found.done + 1] = found.states[: found.done + 1]
             progress()
 
-    def together(needles: FloatArray, table: FloatArray, some: IntArray) -> None:
-        lanes.run(needles, table, layers, inputs, some, wide, wide_kept, completed)
+    def together(needles: FloatArray, modes: LaneModes, some: IntArray) -> None:
+        advance = run_many if modes.count > 2 else lanes.run
+        advance(needles, modes, layers, inputs, some, wide, wide_kept, completed)
         for _ in some:
             progress()
 
@@ -247,7 +252,7 @@ def _take(
     for reach, some in groups.items():
         job = alone
         if reach is not None:
-            job = partial(together, lane_constants(each), lane_table(reach, each[0].modes))
+            job = partial(together, lane_constants(each), lane_modes(reach, each[0].modes))
         jobs += [partial(job, some[k : k + size]) for k in range(0, len(some), size)]
     with ThreadPoolExecutor(workers) as pool:
         for done in [pool.submit(job) for job in jobs]:
@@ -296,11 +301,11 @@ def lane_groups(
 
 
 def _fits(p: NeedleParameters) -> bool:
-    return p.modes <= 2 and p.formulation == 'complete'
+    return p.modes <= MANY and p.formulation == 'complete'
 
 
 def lane_constants(each: Sequence[NeedleParameters]) -> FloatArray:
-    """Return the rows of `lanes.Constants`, shape (runs, 19)."""
+    """Return the rows of `Constants`, shape (runs, 19)."""
     values = np.array([_READ(p) for p in each], dtype=np.float64).T
     columns = dict(zip(_OWN, values[3:], strict=True))
     least, reach, stops = values[:3]
@@ -309,41 +314,65 @@ def lane_constants(each: Sequence[NeedleParameters]) -> FloatArray:
     columns['highest'] = reach * length
     columns['stop'] = np.where(stops, length, inf)
     columns['law'] = np.array([LAW_NUMBERS[p.friction_law] for p in each], dtype=np.float64)
-    return np.column_stack([columns[name] for name in lanes.Constants._fields])
+    return np.column_stack([columns[name] for name in Constants._fields])
 
 
 def lane_layers(each: Sequence[NeedleParameters]) -> FloatArray:
-    """Return the layers of `lanes.run`, shape (runs, m, `lanes.LAYER`)."""
+    """Return the layers of `lanes.run`, shape (runs, m, `LAYER` + pairs of modes)."""
     varied = [k for k, p in enumerate(each) if _fits(p) and (p.swelling or p.layer_depths)]
     most = max((1 + len(each[k].layer_depths) for k in varied), default=0)
-    found = np.zeros((len(each), most, lanes.LAYER))
+    modes = each[0].modes
+    found = np.zeros((len(each), most, LAYER + max(3, modes * (modes + 1) // 2)))
     if most:
         found[:, 1:, 0] = inf
         found[:, 0, 1] = [p.tissue_stiffness for p in each]
     for k in varied:
         layers = NeedleModel(each[k]).compiled.layers
-        gram = layers.gram[(slice(None), *np.triu_indices(each[k].modes))]
+        gram = layers.gram[(slice(None), *np.triu_indices(modes))]
         rows = np.column_stack([layers.starts, layers.stiffnesses, gram])
         found[k, : len(rows), : rows.shape[1]] = rows
     return found
 
 
 @cache
-def lane_table(reach: float, modes: int) -> FloatArray:
-    """Return the series of two modes of length 1 for `lanes.run`: 1 + 4 m terms."""
-    series = mode_shapes(1.0, 2, reach).tables.series[:, : lanes.COLUMNS]
+def lane_modes(reach: float, modes: int) -> LaneModes:
+    """Return the modes of length 1 for `lanes.run`."""
+    if modes > 2:
+        return LaneModes(modes, _pieces(reach, modes))
+    series = mode_shapes(1.0, 2, reach).tables.series[:, :COLUMNS]
     more = -(len(series) - 1) % 4
-    table = np.concatenate([series, np.zeros((more, lanes.COLUMNS))])
+    table = np.concatenate([series, np.zeros((more, COLUMNS))])
     if modes == 1:
         # The second mode has no effect.
-        table[:, lanes.SECOND] = 0.0
-    return table
+        table[:, SECOND] = 0.0
+    return LaneModes(2, table)
+
+
+def _pieces(reach: float, modes: int) -> FloatArray:
+    """Return the polynomials of `many_lanes`, interpolated at Chebyshev nodes."""
+    count = ceil(reach * PIECES)
+    shapes, upper = mode_shapes(1.0, modes, count / PIECES), np.triu_indices(modes)
+    angles = (np.arange(TERMS) + 0.5) * np.pi / TERMS
+    # Powers, the highest first, of each Chebyshev polynomial.
+    powers = np.zeros((TERMS, TERMS))
+    for k, one in enumerate(np.eye(TERMS)):
+        own = chebyshev.cheb2poly(one)
+        powers[TERMS - len(own) :, k] = own[::-1]
+    table = []
+    for piece in range(count):
+        rows = []
+        for xi in (piece + 0.5 + 0.5 * np.cos(angles)) / PIECES:
+            at = shapes.integrals(xi)
+            gram, curved = at.gram[upper] / xi**5, at.curvature_gram[upper] / xi
+            rows.append(np.concatenate([gram, curved, at.value / xi**2, at.curvature]))
+        table.append(powers @ chebyshev.chebfit(np.cos(angles), np.array(rows), TERMS - 1))
+    return np.concatenate(table)
 
 
 def lane_states(states: FloatArray) -> FloatArray:
     """Return states of one mode, shape (..., 6), with a second one, (..., 8); else the same."""
     if states.shape[-1] != len(_ONE_MODE):
         return states
-    found = np.zeros((*states.shape[:-1], lanes.STATE))
+    found = np.zeros((*states.shape[:-1], 8))
     found[..., _ONE_MODE] = states
     return found

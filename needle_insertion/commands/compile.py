@@ -39,6 +39,10 @@ MODULES: Final = (
     *(('needle_study.gym.pushed', 'needle_study.gym.steered') if find_spec('gymnasium') else ()),
 )
 
+#: Modules compiled at their first call: batches of needles with three or four modes, which few
+#: need, and no node calls.
+LATER: Final = ('needle_controller.compiled.many_loop', 'needle_dynamics.compiled.many_batch')
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     portable = 'compile for every processor of the level x86-64-v3, for a wheel'

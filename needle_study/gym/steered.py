@@ -27,7 +27,7 @@ from needle_dynamics.compiled.cutting_lanes import (
     TO,
 )
 from needle_dynamics.compiled.cutting_needle import Cut, Steered
-from needle_dynamics.compiled.lanes import LANES
+from needle_dynamics.compiled.lane_rows import LANES
 from needle_dynamics.compiled.tissue import layer_at
 from needle_study.gym.pushed import BOUND
 import numpy as np

@@ -21,7 +21,7 @@ from needle_dynamics import (
 from needle_dynamics.arrays import BoolArray
 from needle_dynamics.compiled.boxed import Boxed
 from needle_dynamics.compiled.cutting_lanes import DEPTH, ROWS
-from needle_dynamics.compiled.lanes import LANES
+from needle_dynamics.compiled.lane_rows import LANES
 from needle_dynamics.steering.needle import empty_cut, steered, wandering
 from needle_ros.errors import ParameterError
 from needle_study.gym.environment import NeedleEnv, NeedleVectorEnv, picture

@@ -21,7 +21,7 @@ from needle_dynamics import (
     NeedleModel,
     NeedleParameters,
 )
-from needle_dynamics.compiled.lanes import LANES
+from needle_dynamics.compiled.lane_rows import LANES
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.steering.needle import wandering
 from needle_dynamics.steering.parameters import with_lengths

@@ -336,20 +336,25 @@ def test_batch_noise_is_encoder_noise() -> None:
         run_batch(law, NOMINAL, START, REFERENCE, late=-1, **options)
 
 
-@pytest.mark.parametrize('modes', [1, 2])
-def test_insertions_together_equal_batches_of_one(modes: int) -> None:
+# Rounding, which the closed loop amplifies; four modes keep five digits, see `LARGEST_CONDITION`.
+@pytest.mark.parametrize(
+    ('modes', 'least', 'digits'), [(1, 0.0, 1e-9), (2, 0.0, 1e-9), (4, 0.06, 1e-5)]
+)
+def test_insertions_together_equal_batches_of_one(modes: int, least: float, digits: float) -> None:
     """Each with its own needle, reference, noise and delay; alone or not, to the bit."""
     law = InverseDynamics(
         axis=Axis.insertion(NOMINAL), gains=InverseDynamicsGains(), period=PERIOD
     )
-    layers = {'layer_depths': (0.021,), 'layer_stiffnesses': (4e3,), 'swelling': 0.2}
+    needle = replace(NOMINAL, modes=modes, minimum_depth=max(least, NOMINAL.minimum_depth))
+    start = least + 0.02
+    layers = {'layer_depths': (start + 0.001,), 'layer_stiffnesses': (4e3,), 'swelling': 0.2}
     changes: list[dict[str, Any]] = [layers, {'friction_law': 'stribeck'}, {}]
-    models = [NeedleModel(replace(NOMINAL, modes=modes, **one)) for one in changes]
-    starts = [model.state_at(0.02, 2e-4) for model in models]
-    targets = [Setpoint(0.02), Setpoint(0.02), Setpoint(0.0201)]
+    models = [NeedleModel(replace(needle, **one)) for one in changes]
+    starts = [model.state_at(start, 2e-4) for model in models]
+    targets = [Setpoint(start), Setpoint(start), Setpoint(start + 1e-4)]
     references = [
-        MinimumJerk(one, goal, ReferenceLimits())
-        for one, goal in zip(targets, (0.024, 0.022, 0.026), strict=True)
+        MinimumJerk(one, start + path, ReferenceLimits())
+        for one, path in zip(targets, (0.004, 0.002, 0.006), strict=True)
     ]
     rng = np.random.default_rng(2)
     noises = [1e-6 * rng.standard_normal((count, 3)) for count in (700, 400, 900)]
@@ -367,11 +372,10 @@ def test_insertions_together_equal_batches_of_one(modes: int) -> None:
         )  # fmt: skip
         assert found.completed == len(noises[i]) == len(found.commands)
         assert np.array_equal(found.goal, batch.goal)
-        # Several needles with each instruction: rounding, which the closed loop amplifies.
         motion = motion_of(models[i], batch.trajectories[0])
         reached = np.abs(motion).max(axis=1, keepdims=True)
-        assert_allclose(found.motion / reached, motion / reached, atol=1e-9)
-        assert_allclose(found.commands, batch.commands[0], atol=1e-7)
+        assert_allclose(found.motion / reached, motion / reached, atol=digits)
+        assert_allclose(found.commands, batch.commands[0], atol=1e2 * digits)
 
 
 def test_insertion_ends_where_its_needle_leaves_its_range() -> None:
