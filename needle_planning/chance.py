@@ -104,6 +104,8 @@ class Chance(Displayed):
     #: 0 if the probability is lower without this error. Its interval is of the bootstrap.
     entry_tolerance: Estimate
     values: Mapping[str, FloatArray]  #: variables and metrics of each insertion, shape (n,)
+    #: Complete needle of the first insertions in the image, shape (m, k, 3) [m].
+    shafts: FloatArray
 
     def __repr__(self) -> str:
         value, low, high, _ = self.success
@@ -118,6 +120,18 @@ class Chance(Displayed):
         return {
             f'{one} [{unit}]': self.values[one] for one, unit in zip(names, units, strict=True)
         }
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """Return hit, no contact and both as text: meaning, probability and interval."""
+        each = {
+            f'tip within {1e3 * self.radius:g} mm of the target': self.hit,
+            'no contact along the needle': self.clear,
+            'both': self.success,
+        }
+        return [
+            (name, f'{100.0 * p:.1f} %', f'{100.0 * low:.1f} to {100.0 * high:.1f} %')
+            for name, (p, low, high, _) in each.items()
+        ]
 
     def document(self) -> dict[str, Any]:
         """Return the result as numbers, in SI units, for files."""
@@ -149,6 +163,7 @@ def chance_of(
     prior: SteeringPrior | None = None,
     law: str = DEFAULT_LAW,
     workers: int | None = None,
+    shafts: int = 0,
     progress: Progress | None = None,
 ) -> Chance:
     """
@@ -184,6 +199,8 @@ def chance_of(
     workers : int, optional
         Number of processes, by default one per core; 1 for this process. Others are spawned: a
         script needs ``if __name__ == '__main__':``.
+    shafts : int
+        Number of insertions, from the first on, whose complete needle is kept.
     progress : callable, optional
         Called with the number of insertions that are done, and of all.
 
@@ -201,6 +218,7 @@ def chance_of(
     check_whole('insertions', insertions, 1, MOST_INSERTIONS)
     count = (os.cpu_count() or 1) if workers is None else workers
     check_whole('workers', count, 1, MOST_INSERTIONS)
+    check_whole('shafts', shafts, 0, insertions)
     if not is_number(radius) or not (radius > 0.0 and isfinite(radius)):
         raise ParameterError(f'radius must be > 0 m, got {radius!r}')
     # Imported here: it imports Numba.
@@ -220,6 +238,7 @@ def chance_of(
         given = dict(POPULATION if population is None else population)
         studies = _studies(document, insertions, given, list(correlations))
         values, by_entry, by_cause = _simulated(studies, Path(folder), count, progress)
+        kept = _shafts(studies[0], shafts)
     groups = studies[-1]
     # As for independent samples: with so many variables and noise, a Sobol sequence has nearly
     # their variance, and an estimate of it from 16 sequences is less certain.
@@ -233,6 +252,7 @@ def chance_of(
         causes=_largest(by_cause['success'], groups),
         entry_tolerance=_estimated(by_entry['entry_radius'], by_entry['success'], seed),
         values=values,
+        shafts=kept,
     )
 
 
@@ -305,6 +325,19 @@ def _simulated(
             names = 'sample', *study.population, *study.scenario.metrics
             found.append({name: column(results.table, name) for name in names})
     return found
+
+
+def _shafts(study: Study, count: int) -> FloatArray:
+    """Return the complete needles of the first samples, shape (count, k, 3)."""
+    if not count:
+        return np.empty((0, 0, 3))
+    drawn = study.draw(range(count))
+    samples = ({name: float(one[k]) for name, one in drawn.items()} for k in range(count))
+    found = [
+        study.scenario.shaft(sample, study.design.noise(k))  # type: ignore[attr-defined]
+        for k, sample in enumerate(samples)
+    ]
+    return np.stack(found)
 
 
 def _in_this_process(study: Study, advance: Callable[[int], object]) -> dict[str, FloatArray]:

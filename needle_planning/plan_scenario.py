@@ -217,6 +217,10 @@ class PlanScenario(Scenario):
     ) -> Iterator[MeasuredRun]:
         raise ParameterError('insertions along a plan are not recorded')
 
+    def shaft(self, sample: Row, rng: np.random.Generator) -> FloatArray:
+        """Return the complete needle of a sample in the image, shape (k, 3) [m]."""
+        return np.asarray(self._inserted(self.row(sample), rng)[1][-1])
+
     def _inserted(self, row: Row, rng: np.random.Generator) -> tuple[dict[str, float], FloatArray]:
         """Return the metrics of an insertion, and the shafts in the image, shape (n, k, 3)."""
         inputs, seed = self._inputs, int(rng.integers(_SEEDS))

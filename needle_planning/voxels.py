@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import permutations
 from math import prod
-from typing import BinaryIO, Final, NamedTuple, TypeAlias
+from typing import BinaryIO, Final, NamedTuple, TypeAlias, TypeVar
 
 from needle_dynamics import FloatArray
 from needle_planning.anatomy import check_axes, SegmentationError
 import numpy as np
 from numpy.typing import NDArray
 
+_Image = TypeVar('_Image', bound=NDArray[np.integer])
 Values: TypeAlias = NDArray[np.unsignedinteger]  #: values of voxels, 0 for the background
 
 #: Largest number of voxels of a file; all grids have twice as many. 1.4 GB are used at most.
@@ -103,7 +104,7 @@ def planes(values: Values, like: Values | None = None) -> Values:
     return np.moveaxis(values, int(np.argmax(np.abs(strides))), 0)
 
 
-def turned(values: Values, to_patient: FloatArray) -> tuple[Values, FloatArray]:
+def turned(values: _Image, to_patient: FloatArray) -> tuple[_Image, FloatArray]:
     """Permute and reverse the axes of an image so that they are nearest to those of RAS."""
     check_axes(to_patient)
     axes = to_patient[:3, :3] / np.linalg.norm(to_patient[:3, :3], axis=0)

@@ -83,6 +83,8 @@ REPORTS: Final = (
             '132mm,37mm,-1mm',
             '--entry-radius',
             '3mm',
+            '--insertions',
+            '200',
             '--page',
             'FILE',
         ),

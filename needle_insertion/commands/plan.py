@@ -9,7 +9,7 @@ from functools import partial
 from math import isfinite
 from pathlib import Path
 from time import perf_counter
-from typing import Any, TYPE_CHECKING
+from typing import Any, Final, TYPE_CHECKING
 
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.needles import DEFAULT_NEEDLE
@@ -26,6 +26,8 @@ import numpy as np
 if TYPE_CHECKING:
     # Takes half a second to import.
     from needle_planning.chance import Chance
+
+_SHOWN: Final = 50  #: Inserted needles on the page.
 
 #: Options whose value may begin with a minus sign.
 SIGNED = ('--target', '--entry')
@@ -109,8 +111,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--page',
         type=Path,
         metavar='FILE.html',
-        help='page to write: sections of the anatomy with the needle, and all numbers; its '
-        'pictures are written to the same folder',
+        help='page to write: anatomy and needle in 3D and in sections, with the needles of the '
+        'simulated insertions, and all numbers; its pictures are written to the same folder',
     )
     common.add_flag(parser, '--json', 'print JSON instead of a table')
 
@@ -159,7 +161,7 @@ def run(options: argparse.Namespace) -> int:
         with ProgressLine('page', brief=True):
             from needle_insertion.report.plan_page import write_plan_page
 
-            write_plan_page(plan, anatomies, options.page)
+            write_plan_page(plan, anatomies, options.page, chance or None)
         files.append(options.page)
     document, text = document_of(plan, seconds), text_of(plan, seconds)
     if chance:
@@ -186,7 +188,12 @@ def _simulation(options: argparse.Namespace) -> Callable[..., Chance] | None:
     if options.population is not None:
         given['population'], given['correlations'] = read_population(options.population)
     return partial(
-        chance_of, insertions=options.insertions, seed=options.seed, radius=options.radius, **given
+        chance_of,
+        insertions=options.insertions,
+        seed=options.seed,
+        radius=options.radius,
+        shafts=min(options.insertions, _SHOWN) if options.page is not None else 0,
+        **given,
     )
 
 
@@ -246,22 +253,14 @@ def text_of(plan: Plan, seconds: float) -> str:
 
 def chance_text(chance: Chance) -> str:
     """Return the results of simulated insertions as a table and text."""
-    radius = f'{1e3 * chance.radius:g} mm'
-    rows = [
-        (name, f'{100.0 * one.value:.1f} %', f'{100.0 * one.low:.1f} to {100.0 * one.high:.1f} %')
-        for name, one in (
-            (f'tip within {radius} of the target', chance.hit),
-            ('no contact along the needle', chance.clear),
-            ('both', chance.success),
-        )
-    ]
     causes = ', '.join(
         f'{name} ({100.0 * one.value:.0f} %, {100.0 * one.low:.0f} to {100.0 * one.high:.0f} %)'
         for name, one in chance.causes
     )
     tolerance = 1e3 * np.array(chance.entry_tolerance[:3])
+    heads = f'{chance.insertions} insertions', 'probability', '95 % interval'
     return (
-        f'{table(rows, (f"{chance.insertions} insertions", "probability", "95 % interval"))}\n\n'
+        f'{table(chance.rows(), heads)}\n\n'
         f'largest causes of failure, fraction of its variance: {causes or "none found"}\n'
         'tolerated error of the entry point: {:.1f} mm ({:.1f} to {:.1f} mm)'.format(*tolerance)
     )

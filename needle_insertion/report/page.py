@@ -6,6 +6,7 @@ Pages load no other files, and their content security policy forbids it. The sam
 same bytes, except for the date. Templates escape all inserted text.
 """
 
+from abc import ABC, abstractmethod
 import base64
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,9 +23,6 @@ from needle_insertion.report.content import Picture
 from needle_insertion.report.insertion import evenly
 from needle_insertion.report.made import made
 from needle_ros.files import write_whole
-
-#: Scripts: drawing (also used by `needle watch`), and player.
-_SCRIPTS: Final = ('needle.js', 'animation.js')
 
 _POINTS: Final = 40  #: largest number of points of a needle
 
@@ -63,8 +61,42 @@ _POWER: Final = re.compile(r'\^(?:([2-4])(?![\d/])|(-?\d+(?:/\d+)?|T\b))')
 _MICROMETERS: Final = re.compile(r'(?<=\d )um\b')
 
 
+class Interactive(ABC):
+    """Figure of a page that its script draws."""
+
+    caption: str
+
+    @property
+    @abstractmethod
+    def content(self) -> Mapping[str, Any]:
+        """Content of the script, for JSON."""
+
+    @property
+    @abstractmethod
+    def scripts(self) -> Sequence[str]:
+        """Files of the script, in the folder of the templates."""
+
+    @property
+    def data(self) -> Markup:
+        """JSON data of the script, escaped so that it cannot close its HTML element."""
+        text = json.dumps(self.content, separators=(',', ':'), allow_nan=False)
+        return Markup(text.replace('<', r'\u003c'))  # noqa: S704
+
+    @property
+    def script(self) -> Markup:
+        parts = [(TEMPLATE_FOLDER / name).read_text(encoding='utf-8') for name in self.scripts]
+        # Trusted: the scripts are part of this package.
+        return Markup('\n'.join(parts))  # noqa: S704
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 source expression of the script for the content security policy."""
+        made = sha256(self.script.encode()).digest()
+        return f'sha256-{base64.b64encode(made).decode("ascii")}'
+
+
 @dataclass(frozen=True, eq=False)
-class Animation:
+class Animation(Interactive):
     """Animation of a needle from frames."""
 
     caption: str
@@ -73,8 +105,11 @@ class Animation:
     frames: Sequence[Mapping[str, Any]]
 
     @property
-    def data(self) -> Markup:
-        """JSON data of the script, escaped so that it cannot close its HTML element."""
+    def scripts(self) -> Sequence[str]:
+        return 'needle.js', 'animation.js'
+
+    @property
+    def content(self) -> Mapping[str, Any]:
         frames = [{key: frame[key] for key in _DRAWN} for frame in self.frames]
         for frame in frames:
             frame['needle'] = [
@@ -84,21 +119,7 @@ class Animation:
         paths = [frame['path'] for frame in self.frames if frame['path']]
         # The last cut path contains all earlier paths.
         path = paths[-1] if paths else [[], [], []]
-        content = {'scene': self.scene, 'frames': frames, 'path': path}
-        text = json.dumps(content, separators=(',', ':'), allow_nan=False)
-        return Markup(text.replace('<', r'\u003c'))  # noqa: S704
-
-    @property
-    def script(self) -> Markup:
-        parts = [(TEMPLATE_FOLDER / name).read_text(encoding='utf-8') for name in _SCRIPTS]
-        # Trusted: the scripts are part of this package.
-        return Markup('\n'.join(parts))  # noqa: S704
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 source expression of the script for the content security policy."""
-        made = sha256(self.script.encode()).digest()
-        return f'sha256-{base64.b64encode(made).decode("ascii")}'
+        return {'scene': self.scene, 'frames': frames, 'path': path}
 
 
 def _symbols(words: str) -> Markup:
@@ -175,7 +196,7 @@ def write_page(
     path: Path,
     template: str | Template,
     pictures: Iterable[Picture] = (),
-    animation: Animation | None = None,
+    animation: Interactive | None = None,
     **content: Any,
 ) -> None:
     """

@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import find_needle
 from needle_dynamics.steering.needle import SteeredNeedle
+from needle_insertion.report.anatomy_view import AnatomyView
 from needle_insertion.report.content import Picture
 from needle_insertion.report.page import write_page
 from needle_insertion.report.section import (
@@ -27,6 +28,7 @@ from needle_insertion.report.section import (
     section,
 )
 from needle_planning.anatomy import Anatomy, ROLES
+from needle_planning.chance import Chance
 from needle_planning.clearance import Clearance
 from needle_planning.paths import inserted_shape, Line
 from needle_planning.plan import Plan
@@ -47,6 +49,7 @@ _HEADS: Final = (
     'depth [mm]', 'guide x [mm]', 'guide z [mm]', 'tip R [mm]', 'tip A [mm]', 'tip S [mm]',
     'clearance [mm]', 'limited by',
 )  # fmt: skip
+_SPREAD: Final = '#b00020', '#1c2128'  #: Colors of inserted needles: failure, success.
 _MARKERS: Final = 'osD^vPX'  #: Markers of the structures of the chart.
 
 
@@ -58,9 +61,16 @@ class _Shaft(NamedTuple):
     along: FloatArray  #: position of points in the tissue along the line [m], shape (p,)
     clearances: FloatArray  #: clearance of these points [m], shape (p,)
     nearest: list[str]  #: structure that limits it
+    inserted: FloatArray  #: needles of simulated insertions [m], shape (m, k, 3)
+    success: list[bool]  #: whether each of them succeeds
 
 
-def write_plan_page(plan: Plan, anatomy: Anatomy | Sequence[Anatomy], path: Path | str) -> None:
+def write_plan_page(
+    plan: Plan,
+    anatomy: Anatomy | Sequence[Anatomy],
+    path: Path | str,
+    chance: Chance | None = None,
+) -> None:
     """
     Write the page of a plan, and its pictures in the same folder.
 
@@ -72,6 +82,8 @@ def write_plan_page(plan: Plan, anatomy: Anatomy | Sequence[Anatomy], path: Path
         Segmented images, as for `find_plan`.
     path : Path or str
         File to write (.html).
+    chance : Chance, optional
+        Simulated insertions along the plan, whose needles and probabilities are shown.
 
     Raises
     ------
@@ -86,17 +98,25 @@ def write_plan_page(plan: Plan, anatomy: Anatomy | Sequence[Anatomy], path: Path
         every, np.concatenate([one.corners for one in planes]), radius=plan.radius
     )
     _check(plan, every, legend, clearance)
-    shaft = _shaft(plan, clearance)
+    shaft = _shaft(plan, clearance, chance)
     pictures = [
         _picture(plan, legend, shaft, name, section(every, legend, clearance, plan.radius, one))
         for name, one in zip(('plan_x', 'plan_z', 'plan_across'), planes, strict=True)
     ]
     near = f'to {plan.structure}' if plan.structure else 'to all obstacles'
     bent = plan.guide.any()
+    words = 'Drag to turn, or use the arrow keys. Obstacles are opaque, all else is translucent.'
+    if chance is not None and len(shaft.inserted):
+        words += f' Lines: {len(shaft.inserted)} of {chance.insertions} simulated insertions.'
+    solid = AnatomyView(
+        words, plan, every, legend, shaft.final, clearance.at(shaft.final), shaft.inserted,
+        shaft.success,
+    )  # fmt: skip
     write_page(
         Path(path),
         'plan.html',
         [*pictures, _by_depth(plan, legend, shaft)],
+        solid,
         introduction=f'Needle {plan.needle} from the skin to the target, '
         f'{"bowed by the guide" if bent else "straight"}, in {len(plan.guide)} steps. '
         'Clearances are beyond the margins of the obstacles.',
@@ -104,7 +124,9 @@ def write_plan_page(plan: Plan, anatomy: Anatomy | Sequence[Anatomy], path: Path
             ('Least clearance', f'{_mm(plan.clearance)} mm', near),
             ('Length', f'{_mm(plan.length)} mm', f'{len(plan.guide)} steps'),
             ('Bow', f'{_mm(plan.bow)} mm', 'largest deflection from the straight line'),
+            *([] if chance is None else [('Success', *chance.rows()[-1][1:])]),
         ],
+        chances=[] if chance is None else chance.rows(),
         sections=pictures,
         guide='The guide is at zero until the needle has pierced the skin. It moves to the '
         'setpoint of a step while the needle rests, and rests while the needle is inserted.'
@@ -191,8 +213,8 @@ def _check(plan: Plan, anatomies: Sequence[Anatomy], legend: Legend, clearance: 
         )
 
 
-def _shaft(plan: Plan, clearance: Clearance) -> _Shaft:
-    """Insert the needle of a plan."""
+def _shaft(plan: Plan, clearance: Clearance, chance: Chance | None = None) -> _Shaft:
+    """Insert the needle of a plan; return it with the needles of simulated insertions."""
     needle, steering, _ = find_needle(plan.needle)
     one = SteeredNeedle(needle, replace(steering, path_noise=0.0), roll=plan.roll)
     line = Line(plan.entry, plan.axes)
@@ -217,6 +239,8 @@ def _shaft(plan: Plan, clearance: Clearance) -> _Shaft:
         (points - plan.entry) @ line.axes[1],
         clearance.at(points),
         [clearance.structure_at(point) for point in points],
+        np.empty((0, 0, 3)) if chance is None else chance.shafts,
+        [] if chance is None else (chance.values['success'][: len(chance.shafts)] > 0).tolist(),
     )
 
 
@@ -251,13 +275,16 @@ def _picture(plan: Plan, legend: Legend, shaft: _Shaft, name: str, shown: Sectio
         labels = 'guide axis x', 'guide axis z'
     else:
         draw_section(axes, shown, legend, np.concatenate([line, tip]))
-        marks = _draw_needle(axes, plan, line, tip, place, target)
+        marks = _draw_inserted(axes, plane.coordinates(shaft.inserted), shaft.success)
+        marks += _draw_needle(axes, plan, line, tip, place, target)
         labels = 'depth', f'guide axis {name[-1]}'
         words = f'Section through the line from entry point to target, along {labels[1]}.'
         normal = np.cross(*plane.axes)
         off = float(np.abs((shaft.final - plane.origin) @ normal).max())
         if off >= _VISIBLE:
             words += f' The needle is projected: it is up to {_mm(off)} mm from this section.'
+        if len(shaft.inserted):
+            words += f' Also projected: {len(shaft.inserted)} needles of simulated insertions.'
     axes.set(xlabel=f'{labels[0]} [mm]', ylabel=f'{labels[1]} [mm]')
     rows = _add_legend(drawing, legend, shown, marks)
     below, picture = 0.6 + 0.18 * rows, width * tall / wide
@@ -288,6 +315,22 @@ def _draw_circles(axes: Any, plan: Plan, place: FloatArray) -> list[Any]:
             (free, {'fill': False, 'ls': '--', 'lw': 1.4, 'label': 'free of margins'}),
         )
     ]
+
+
+def _draw_inserted(axes: Any, lines: FloatArray, success: Sequence[bool]) -> list[Any]:
+    """Draw inserted needles, shape (m, k, 2), in mm."""
+    from matplotlib.collections import LineCollection
+
+    marks = []
+    for wanted, style, name in ((True, '-', 'success'), (False, '--', 'failure')):
+        some = 1e3 * lines[np.array(success, dtype=np.bool_) == wanted]
+        if len(some):
+            added = LineCollection(
+                list(some), colors=_SPREAD[wanted], lw=0.7, ls=style, zorder=3,
+                label=f'inserted, {name}',
+            )  # fmt: skip
+            marks.append(axes.add_collection(added, autolim=False))
+    return marks
 
 
 def _draw_needle(

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import base64
 from dataclasses import replace
 from itertools import combinations, permutations, product
 from pathlib import Path
@@ -13,8 +15,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from needle_dynamics import FloatArray
 from needle_insertion.cli import main
 from needle_insertion.report import plan_page
+from needle_insertion.report.anatomy_view import AnatomyView
 from needle_insertion.report.section import directions, legend_of, Plane, sample, section
-from needle_planning import Anatomy, find_plan, Plan, read_anatomy, Structure
+from needle_planning import Anatomy, Chance, chance_of, find_plan, Plan, read_anatomy, Structure
 from needle_planning.clearance import Clearance
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -22,6 +25,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.anatomies import affine
 from support.pages import look_at
+from tools.browser import BROWSER, browser
 
 LIVER = Path(__file__).parents[2] / 'examples' / 'liver'
 FILES = (LIVER / 'liver.seg.nrrd', LIVER / 'labels.yaml')
@@ -75,6 +79,11 @@ def anatomy() -> Anatomy:
 def bowed() -> Plan:
     entry = (0.132, 0.037, -0.001)
     return find_plan(read_anatomy(*FILES), (0.062, 0.012, 0.01), entry=entry, entry_radius=3e-3)
+
+
+@pytest.fixture(scope='module')
+def chance(straight: Plan, anatomy: Anatomy) -> Chance:
+    return chance_of(straight, anatomy, insertions=16, seed=3, workers=1, shafts=12)
 
 
 @settings(deadline=None, max_examples=40)
@@ -271,14 +280,103 @@ def test_page_has_all_numbers_of_the_plan(bowed: Plan, tmp_path: Path) -> None:
     assert all(words and width > 0 for words, width in seen.images)
 
 
+def view_of(plan: Plan, anatomy: Anatomy, chance: Chance) -> AnatomyView:
+    legend = legend_of([anatomy], plan.structure)
+    planes = plan_page._planes(plan, legend)
+    corners = np.concatenate([one.corners for one in planes])
+    clearance = Clearance([anatomy], corners, radius=plan.radius)
+    shaft = plan_page._shaft(plan, clearance, chance)
+    return AnatomyView(
+        '', plan, [anatomy], legend, shaft.final, clearance.at(shaft.final), shaft.inserted,
+        shaft.success,
+    )  # fmt: skip
+
+
+def test_view_has_surfaces_needle_and_insertions(
+    straight: Plan, anatomy: Anatomy, chance: Chance
+) -> None:
+    content = view_of(straight, anatomy, chance).content
+    middle = 5e2 * (straight.entry + straight.target)
+    assert [one['name'] for one in content['structures']] == ['皮膚', '_bone $<1', 'muscle']
+    for one in content['structures']:
+        values = np.frombuffer(base64.b64decode(one['points']), '<i2').reshape(-1, 3)
+        triangles = np.frombuffer(base64.b64decode(one['triangles']), '<u2')
+        assert triangles.max() < len(values)
+        points = 1e-3 * (content['unit'] * values + middle)
+        (label,) = (k for k, named in anatomy.structures.items() if named.name == one['name'])
+        index = np.argwhere(anatomy.labels == label)
+        found = (points - anatomy.to_patient[:3, 3]) @ np.linalg.inv(anatomy.to_patient[:3, :3]).T
+        # Half a voxel, rounded edges, and merged points.
+        np.testing.assert_allclose(found.min(axis=0), index.min(axis=0) - 0.5, atol=0.5)
+        np.testing.assert_allclose(found.max(axis=0), index.max(axis=0) + 0.5, atol=0.5)
+    needle = content['needle']
+    # Rounded to 0.01 mm; the needle of the page ends at the target to 0.2 mm.
+    np.testing.assert_allclose(needle['points'][-1], 1e3 * straight.target, atol=0.2)
+    # The points drawn are up to 1 mm from the least clearance, which changes as the distance.
+    assert min(needle['clearance']) == pytest.approx(1e3 * straight.clearance, abs=1.0)
+    ends = [one['points'][-1] for one in content['inserted']]
+    tips = 1e3 * np.stack([chance.values[f'tip_{axis}'][:12] for axis in 'ras'], axis=1)
+    np.testing.assert_allclose(ends, tips, atol=0.0051)
+    success = [one['success'] for one in content['inserted']]
+    assert success == (chance.values['success'][:12] > 0).tolist()
+
+
+@pytest.mark.skipif(BROWSER is None, reason='no Chromium on this machine')
+def test_anatomy_turns_in_a_browser(
+    straight: Plan, anatomy: Anatomy, chance: Chance, tmp_path: Path
+) -> None:
+    """Keys, buttons and choices draw another picture, and nothing is loaded or too wide."""
+    path = tmp_path / 'plan.html'
+    plan_page.write_plan_page(straight, anatomy, path, chance)
+    # Surfaces and script; the pictures are half a megabyte.
+    assert path.stat().st_size < 2e6
+
+    async def look() -> None:
+        async with browser() as tab:
+            await tab.size(400, 900)
+            await tab.open(path.as_uri())
+            drawn = "Number(document.querySelector('.solid').dataset.drawn || 0)"
+            await tab.wait(f'{drawn} > 0', 'the first picture')
+            pixels = (
+                "(() => { const one = document.querySelector('.stage canvas'); "
+                "const made = document.createElement('canvas'), pen = made.getContext('2d'); "
+                'Object.assign(made, {width: one.width, height: one.height}); '
+                'needleAnatomyView.draw(); pen.drawImage(one, 0, 0); return made.toDataURL() })()'
+            )
+            canvas = "document.querySelector('.stage canvas')"
+            pictures = [await tab.run(pixels)]
+            for action in (
+                "document.querySelectorAll('.solid button')[4].click()",
+                "document.querySelectorAll('.solid button')[5].click()",
+                "document.querySelectorAll('.solid input')[1].click()",
+                f'{canvas}.dispatchEvent(new KeyboardEvent("keydown", {{key: "ArrowLeft"}}))',
+            ):
+                await tab.run(action)
+                pictures.append(await tab.run(pixels))
+            assert len(set(pictures)) == len(pictures)
+            names = await tab.run("document.querySelector('.solid').innerText")
+            assert 'inserted, failure' in names
+            assert '_bone $<1 (obstacle)' in names
+            wide = 'document.documentElement.scrollWidth - document.documentElement.clientWidth'
+            assert await tab.run(wide) == 0
+            await tab.call('Emulation.setEmulatedMedia', media='print')
+            assert await tab.run("document.querySelector('.solid').clientHeight") == 0
+            assert tab.faults == []
+
+    asyncio.run(look())
+
+
 def test_command_writes_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With the command in its last line; the page is of the plan that is printed."""
     file = tmp_path / 'plan.html'
     words = ['plan', str(FILES[0]), '--labels', str(FILES[1]), '--target', '62mm,12mm,10mm']
-    assert main([*words, '--straight', '--resolution', '2mm', '--page', str(file)]) == 0
+    some = ['--straight', '--resolution', '2mm', '--insertions', '3', '--page', str(file)]
+    assert main([*words, *some]) == 0
     text = capsys.readouterr().out
     assert text.endswith(f'wrote {file}\n')
     seen = look_at(file).text
+    assert '3 of 3 simulated insertions' in seen
+    assert 'no contact along the needle' in seen
     assert 'needle plan ' in seen
     entry = next(line.split()[1:] for line in text.splitlines() if line.startswith('entry '))
     assert all(one in seen for one in entry)

@@ -150,6 +150,19 @@ def test_result_does_not_depend_on_the_number_of_workers(straight: Plan) -> None
         np.testing.assert_array_equal(values, two.values[name])
 
 
+def test_kept_needles_are_those_of_the_first_insertions(straight: Plan) -> None:
+    """From the skin to the tip that was counted."""
+    found = chance_of(straight, WIDE, insertions=6, seed=3, workers=1, shafts=4)
+    tips = np.stack([found.values[f'tip_{axis}'][:4] for axis in 'ras'], axis=1)
+    np.testing.assert_array_equal(found.shafts[:, -1], tips)
+    lengths = np.linalg.norm(np.diff(found.shafts, axis=1), axis=2).sum(axis=1)
+    # Slopes are small: the path is longer than the depth by less than 1 %.
+    np.testing.assert_allclose(lengths, straight.length, rtol=0.01)
+    assert chance_of(straight, WIDE, insertions=2, workers=1).shafts.shape == (0, 0, 3)
+    with pytest.raises(ParameterError, match='shafts must be'):
+        chance_of(straight, WIDE, insertions=2, workers=1, shafts=3)
+
+
 def test_probability_holds_with_other_random_numbers(tmp_path: Path, straight: Plan) -> None:
     """The interval of 200 insertions contains the fraction of 500 others."""
     stated = chance_of(straight, WIDE, insertions=200, seed=1)

@@ -300,5 +300,5 @@ const needleDrawing = (() => {
     if (tip) ring(pen, x(from(tip)[0]), y(from(tip)[1]), 5);
   }
 
-  return {Drawing, aim, prepared, stroke, label, COLORS};
+  return {Drawing, aim, prepared, stroke, label, cross, COLORS};
 })();
