@@ -114,12 +114,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='page to write: anatomy and needle in 3D and in sections, with the needles of the '
         'simulated insertions, and all numbers; its pictures are written to the same folder',
     )
+    parser.add_argument(
+        '--slicer',
+        type=Path,
+        metavar='FOLDER',
+        help='folder of files for 3D Slicer to write: needle as a curve (needle.mrk.json) and as '
+        'a model (needle.vtk), entry point and target (points.mrk.json)',
+    )
     common.add_flag(parser, '--json', 'print JSON instead of a table')
 
 
 def run(options: argparse.Namespace) -> int:
     common.check_file(options.output)
     common.check_file(options.page)
+    common.check_folder(options.slicer)
     target = _position('--target', options.target)
     limits = SteeringLimits(
         step_length=options.step,
@@ -163,6 +171,11 @@ def run(options: argparse.Namespace) -> int:
 
             write_plan_page(plan, anatomies, options.page, chance or None)
         files.append(options.page)
+    if options.slicer is not None:
+        from needle_insertion.slicer.plan_files import write_slicer
+
+        common.make_folder(options.slicer)
+        files += write_slicer(plan, anatomies, options.slicer)
     document, text = document_of(plan, seconds), text_of(plan, seconds)
     if chance:
         document['simulation'] = chance.document()

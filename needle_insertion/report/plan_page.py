@@ -4,14 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from math import ceil
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
-from needle_dynamics.needles import find_needle
-from needle_dynamics.steering.needle import SteeredNeedle
 from needle_insertion.report.anatomy_view import AnatomyView
 from needle_insertion.report.content import Picture
 from needle_insertion.report.page import write_page
@@ -30,16 +27,15 @@ from needle_insertion.report.section import (
 from needle_planning.anatomy import Anatomy, ROLES
 from needle_planning.chance import Chance
 from needle_planning.clearance import Clearance
-from needle_planning.paths import inserted_shape, Line
 from needle_planning.plan import Plan
+from needle_planning.planned_needle import complete_needle, shafts
 from needle_ros.errors import ParameterError
 import numpy as np
 
 _AROUND: Final = 0.015  #: Length before the entry point and beyond the target in a section [m].
 _HALF: Final = (0.02, 0.035, 0.06)  #: Half of the width: least, usual and largest [m].
 _PIXELS: Final = 880  #: Pixels along the longer side of a section.
-_POINTS: Final = 5e-4  #: Distance of the points of the shaft [m].
-#: Largest difference of clearance and tip between plan and page; the plan states it to 50 um [m].
+#: Largest difference of clearance between plan and page; the plan states it to 50 um [m].
 _SAME: Final = 2e-4
 _WIDTH: Final = 8.0  #: Width of a picture [inches].
 _VISIBLE: Final = 1e-4  #: Distance from a section that is stated [m].
@@ -215,39 +211,22 @@ def _check(plan: Plan, anatomies: Sequence[Anatomy], legend: Legend, clearance: 
 
 def _shaft(plan: Plan, clearance: Clearance, chance: Chance | None = None) -> _Shaft:
     """Insert the needle of a plan; return it with the needles of simulated insertions."""
-    needle, steering, _ = find_needle(plan.needle)
-    one = SteeredNeedle(needle, replace(steering, path_noise=0.0), roll=plan.roll)
-    line = Line(plan.entry, plan.axes)
     limits = [clearance.structure_at(plan.entry)]
-    points = np.empty((0, 3))
-    for guide, depth in zip(plan.guide.tolist(), plan.depths[1:].tolist(), strict=True):
-        one.move(guide=guide)
-        before = _points(one, line, 0.0)
-        one.move(depth=depth)
-        points = np.concatenate([before, _points(one, line, 0.0)])
-        limits.append(clearance.structure_at(points[clearance.at(points).argmin()]))
-    off = float(np.linalg.norm(points[-1] - plan.path[-1]))
-    if not off < _SAME:
-        raise ParameterError(
-            f'the needle {plan.needle} is not the one of the plan: its tip ends {_mm(off)} mm '
-            'from the path'
-        )
-    points = _points(one, line, 0.0)
+    # After each motion of the guide, and after the insertion that follows.
+    every = list(shafts(plan))
+    for before, after in zip(every[::2], every[1::2], strict=True):
+        step = np.concatenate([before, after])
+        limits.append(clearance.structure_at(step[clearance.at(step).argmin()]))
+    points = every[-1]
     return _Shaft(
-        _points(one, line, -min(_AROUND, steering.free_length)),
+        complete_needle(plan, _AROUND),
         limits,
-        (points - plan.entry) @ line.axes[1],
+        (points - plan.entry) @ plan.direction,
         clearance.at(points),
         [clearance.structure_at(point) for point in points],
         np.empty((0, 0, 3)) if chance is None else chance.shafts,
         [] if chance is None else (chance.values['success'][: len(chance.shafts)] > 0).tolist(),
     )
-
-
-def _points(needle: SteeredNeedle, line: Line, start: float) -> FloatArray:
-    count = max(2, round((needle.depth - start) / _POINTS) + 1)
-    depths = np.linspace(start, needle.depth, count)
-    return line.points(depths, inserted_shape(needle, depths)[0])
 
 
 def _picture(plan: Plan, legend: Legend, shaft: _Shaft, name: str, shown: Section) -> Picture:

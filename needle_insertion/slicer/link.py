@@ -107,7 +107,7 @@ def _header(header: bytes) -> tuple[str, str, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkSettings:
-    """Role and address of the connection, and the limit of targets."""
+    """Role and address of the connection, the limit of targets, and a plan to show."""
 
     role: str = choice('server', ('server', 'client'), 'the server waits, the client connects')
     host: str = text(
@@ -117,6 +117,9 @@ class LinkSettings:
     port: int = constant(18944, '1', 'TCP port', low=1.0, high=65535.0, whole=True)
     reach: float = constant(
         0.3, 'm', 'largest accepted distance of a target from the entry point', open_low=True
+    )
+    plan: str = text(
+        '', 'file of a plan (needle plan -o) whose needle is sent to each new peer; empty: none'
     )
 
     def __post_init__(self) -> None:

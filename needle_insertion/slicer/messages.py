@@ -17,10 +17,18 @@ from typing import Any, Final
 from needle_dynamics.arrays import FloatArray
 from needle_insertion.slicer.link import Frame, HEADER
 from needle_insertion.slicer.needle import EntryPose, MILLIMETERS, Registration, Shape
+from needle_insertion.slicer.plan_files import PlannedShape
 from needle_ros.errors import MessageError
 from needle_ros.timing import NANOSECONDS
 import numpy as np
-from pyigtl.messages import CRC64, MessageBase, PointMessage, StringMessage, TransformMessage
+from pyigtl.messages import (
+    CRC64,
+    MessageBase,
+    PointMessage,
+    PolyDataMessage,
+    StringMessage,
+    TransformMessage,
+)
 
 #: Name of the target: a point name in any POINT message, or a device name.
 TARGET: Final = 'TARGET'
@@ -31,6 +39,8 @@ SHAPE_HEADER: Final = 'NeedleShapeHeader'
 TIP: Final = 'NeedleTip'
 TIP_EXPECTED: Final = 'NeedleTipExpected'
 STATE: Final = 'NeedleState'
+PLAN: Final = 'NeedlePlan'
+PLAN_MODEL: Final = 'NeedlePlanModel'
 
 #: Tolerance of a target on the skin, for 32-bit numbers and manual input [m].
 _ROUNDING: Final = 1e-4
@@ -112,6 +122,22 @@ class Interpreter:
         text = '\n'.join(lines).encode('ascii', 'replace').decode()[:_LONGEST_STATE]
         message = StringMessage(text, timestamp=_seconds(stamp), device_name=STATE)
         return bytes(message.pack())
+
+
+def plan_messages(shape: PlannedShape, stamp: int) -> list[bytes]:
+    """Return the needle of a plan as POINT and as POLYDATA, already in the images; time in ns."""
+    time = _seconds(stamp)
+    points = PointMessage(
+        shape.curve,
+        names=[f'{PLAN}{k}' for k in range(len(shape.curve))],
+        timestamp=time,
+        device_name=PLAN,
+    )
+    corners = np.insert(shape.triangles, 0, 3, axis=1).ravel()
+    model = PolyDataMessage(
+        points=shape.points, polygons=corners, timestamp=time, device_name=PLAN_MODEL
+    )
+    return [points.pack(), model.pack()]
 
 
 def _millimeters(at: FloatArray) -> str:

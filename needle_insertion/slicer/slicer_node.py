@@ -16,6 +16,8 @@ from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCova
 from needle_insertion.graph.messages import target_message
 from needle_insertion.slicer.link import Connection, LinkSettings
 from needle_insertion.slicer.needle import MILLIMETERS, NeedleView, NodeStates, Registration, Shape
+from needle_insertion.slicer.plan_files import planned_shape, PlannedShape
+from needle_planning.plan import read_plan
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.contract import Topic
@@ -51,8 +53,9 @@ class SlicerNode(BaseNode):
     It receives POINT, TRANSFORM and STRING messages with a target, in mm in the frame of the
     images, and publishes each target until a node acknowledges it. It transmits the shape of the
     needle and the pose of its tip at 20 Hz, the predicted tip pose, and the state of all nodes
-    from ``/diagnostics``. ``registration.*`` is the pose of ``needle_entry`` in the images. The
-    pose of the tip is also published on ``tip_pose``.
+    from ``/diagnostics``. The needle of ``plan`` is transmitted to each new peer.
+    ``registration.*`` is the pose of ``needle_entry`` in the images. The pose of the tip is also
+    published on ``tip_pose``.
 
     The source of the shape is ``needle_poses``. Without this topic the shape is the line from the
     guide (``joint_states``) to the tip (``tip_deflection``), marked as not measured.
@@ -67,6 +70,9 @@ class SlicerNode(BaseNode):
         self._link: Connection | None = None
         self._events, self._view, self._states = EventLog(), NeedleView(), NodeStates()
         self._interpreter: Interpreter | None = None
+        #: Needle of the plan, and the peer that has received it.
+        self._planned: PlannedShape | None = None
+        self._planned_at = ''
         self._shapes = self._targets = 0
         self._rate = RateCounter()
         #: Unanswered target with its message.
@@ -85,6 +91,7 @@ class SlicerNode(BaseNode):
         settings = self.settings('', LinkSettings)
         registration = self.settings('registration.', Registration)
         self._interpreter = Interpreter(registration, settings.reach)
+        self._planned = planned_shape(read_plan(settings.plan)) if settings.plan else None
         self._link = Connection(settings, is_wanted, self._events)
         self._target = self.publisher(contract.TARGET)
         self._tip_pose = self.publisher(contract.TIP_POSE)
@@ -183,6 +190,7 @@ class SlicerNode(BaseNode):
             link.send(interpreter.state(self.now(), self._states.lines(now)))
             if self._view.expected is not None:
                 link.send(interpreter.tip_expected(self._view.expected))
+        self._send_plan(link)
         self._repeat_target()
         self.publish_events(self._events)
 
@@ -248,6 +256,15 @@ class SlicerNode(BaseNode):
             self._shapes += 1
             self._rate.add(monotonic_ns())
         link.send(interpreter.tip(shape))
+
+    def _send_plan(self, link: Connection) -> None:
+        if self._planned is None or link.peer == self._planned_at:
+            return
+        from needle_insertion.slicer.messages import plan_messages
+
+        sent = [link.send(one) for one in plan_messages(self._planned, self.now())]
+        # A lost peer receives it again when it returns.
+        self._planned_at = link.peer if all(sent) else ''
 
     # Status.
 

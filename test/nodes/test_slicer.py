@@ -16,14 +16,18 @@ from typing import Any
 from benchmarks.igtl_peer import free_port, Peer, Told
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped
+from needle_insertion.slicer.link import Frame, Frames, HEADER
 from needle_insertion.slicer.needle import LINE, MEASURED, Registration
 from needle_insertion.slicer.slicer_node import SlicerNode
+from needle_planning import write_plan
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.status import node_of, SlicerPhase, SlicerStatus
 import numpy as np
 import pyigtl
+from pyigtl.messages import MessageBase
 import pytest
 from sensor_msgs.msg import JointState
+from support.anatomies import plan_of
 from support.ros_graph import RosGraph
 
 #: A bent needle at rest, 6 cm deep, with a displaced guide.
@@ -182,6 +186,34 @@ def test_needle_without_shape_sensor_is_a_line(room: Room) -> None:
     room.until(lambda: room.status().shape_source == LINE, 'the state')
     # Nothing is sent after the end of the inputs.
     room.until(lambda: not room.status().shape_source, 'the end')
+
+
+def test_needle_of_a_plan_is_sent_to_each_new_peer(room: Room, tmp_path: Path) -> None:
+    """As a curve and as a model, in the images whatever the registration is."""
+    entry, direction = np.array([0.02, -0.01, 0.1]), np.array([0.6, 0.0, -0.8])
+    write_plan(plan_of(entry, direction), tmp_path / 'plan.yaml')
+    room.slicer(plan=str(tmp_path / 'plan.yaml'))
+    for _ in range(2):
+        found: dict[str, Frame] = {}
+        frames = Frames(lambda _kind, device: device.startswith('NeedlePlan'), pytest.fail)
+        with closing(socket.socket()) as peer:
+
+            def receive(peer: Any = peer, frames: Frames = frames, found: Any = found) -> bool:
+                with suppress(BlockingIOError):
+                    found.update((one.device, one) for one in frames.take(peer.recv(65536)))
+                return len(found) == 2
+
+            room.until(lambda: not peer.connect_ex(('127.0.0.1', room.port)), 'a connection')
+            peer.setblocking(False)
+            room.until(receive, 'the plan')
+        assert found['NeedlePlanModel'].kind == 'POLYDATA'
+        points = MessageBase.create_message('POINT')
+        data = found['NeedlePlan'].data
+        points.unpack(MessageBase.parse_header(data[: HEADER.size]), data[HEADER.size :])
+        # Messages have 24 bits.
+        np.testing.assert_allclose(points.positions[0], 1e3 * entry, atol=1e-4)
+        ends = 1e3 * (entry + 0.06 * direction)
+        np.testing.assert_allclose(points.positions[-1], ends, atol=1e-4)
 
 
 def test_predicted_tip_pose_is_sent(room: Room) -> None:

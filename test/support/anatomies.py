@@ -7,6 +7,7 @@ from typing import Final
 
 from needle_dynamics import FloatArray
 from needle_planning.anatomy import Anatomy, Structure
+from needle_planning.plan import Plan
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -30,6 +31,18 @@ def affine(
     found[:3, :3] = (np.eye(3) if axes is None else axes) * np.array(spacing)
     found[:3, 3] = origin
     return found
+
+
+def plan_of(entry: FloatArray, direction: FloatArray, displaced: float = 0.0) -> Plan:
+    """Return a straight plan to a depth of 60 mm in six steps, with its path displaced [m]."""
+    depths = np.linspace(0.0, 0.06, 7)
+    return Plan(
+        needle='bending_35mm', radius=6.4e-4, entry=entry, direction=direction,
+        target=entry + 0.06 * direction, roll=0.0, depths=depths, guide=np.zeros((6, 2)),
+        path=entry + np.outer(depths, direction) + displaced, clearances=np.full(7, 3e-3),
+        clearance=3e-3, structure='bone', place=entry, bow=0.0, resolution=5e-4,
+        straight_bound=3.5e-3, bound=5e-3,
+    )  # fmt: skip
 
 
 def center(anatomy: Anatomy, index: ArrayLike) -> FloatArray:
