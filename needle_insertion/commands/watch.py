@@ -6,11 +6,13 @@ from __future__ import annotations
 import argparse
 import asyncio
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
 from needle_insertion.commands.common import add_flag, add_quantity, add_time, print_each
+from needle_planning.plan import Plan, read_plan
 from needle_ros.errors import ParameterError
 from needle_ros.process import ENDINGS
 
@@ -33,6 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'other', type=Path, nargs='?', metavar='OTHER', help='recording to compare with BAG'
     )
+    parser.add_argument(
+        '--plan',
+        type=Path,
+        metavar='PLAN.yaml',
+        help='plan (needle plan -o) whose path and free space are drawn',
+    )
     shift = 'time added to those of OTHER (default: both start to move at the same time)'
     add_quantity(parser, '--shift', 's', shift)
     add_time(parser)
@@ -54,13 +62,14 @@ def run(options: argparse.Namespace) -> int:
         raise ParameterError('--control needs a live insertion: omit --control or the BAG')
     if options.shift is not None and options.other is None:
         raise ParameterError('--shift needs two recordings: add OTHER, or omit --shift')
+    plan = None if options.plan is None else read_plan(options.plan)
     # A signal before the page is served, or a second signal at the end, also ends the command.
     with suppress(KeyboardInterrupt):
-        asyncio.run(_recorded(options) if options.bag is not None else _live(options))
+        asyncio.run((_live if options.bag is None else _recorded)(options, plan))
     return 0
 
 
-async def _recorded(options: argparse.Namespace) -> None:
+async def _recorded(options: argparse.Namespace, plan: Plan | None) -> None:
     from needle_insertion.watch.live import RecordedReader
     from needle_insertion.watch.recorded import compare, ShownRecording
     from needle_insertion.watch.server import Server
@@ -72,16 +81,17 @@ async def _recorded(options: argparse.Namespace) -> None:
         other = ShownRecording(options.other, options.time)
         print_each('warning', other.losses)
         comparison = compare(recording, other, options.shift)
-    await _serve(Server(lambda: RecordedReader(recording, comparison), options.host, options.port))
+    readers = partial(RecordedReader, recording, comparison, plan)
+    await _serve(Server(readers, options.host, options.port))
 
 
-async def _live(options: argparse.Namespace) -> None:
+async def _live(options: argparse.Namespace, plan: Plan | None) -> None:
     from needle_insertion.watch.live import Live, LiveReader
     from needle_insertion.watch.server import Server
     from needle_insertion.watch.watch_node import watching
 
     with watching(control=options.control) as (view, poll, control):
-        live = Live(view, poll, control=options.control)
+        live = Live(view, poll, control=options.control, plan=plan)
         server = Server(lambda: LiveReader(live), options.host, options.port, control)
         making = asyncio.create_task(live.run())
         try:

@@ -11,7 +11,8 @@ from time import monotonic
 from typing import Any, Final
 
 from needle_insertion.watch.recorded import Comparison, PagePlayback, ShownRecording
-from needle_insertion.watch.view import RATE, SPAN, View
+from needle_insertion.watch.view import planned, RATE, SPAN, View
+from needle_planning.plan import Plan
 from needle_ros.errors import ParameterError
 
 PERIOD: Final = 1.0 / RATE  #: time between two frames [s]
@@ -24,9 +25,12 @@ def _json(content: object) -> str:
 class Live:
     """Frames at a fixed rate, the same for all readers; `poll` updates the view at a time [s]."""
 
-    def __init__(self, view: View, poll: Callable[[float], None], *, control: bool) -> None:
+    def __init__(
+        self, view: View, poll: Callable[[float], None], *, control: bool, plan: Plan | None = None
+    ) -> None:
         self._view, self._poll = view, poll
-        self.setting = {'control': control, 'recording': None}
+        shown = None if plan is None else planned(plan)
+        self.setting: dict[str, Any] = {'control': control, 'recording': None, 'plan': shown}
         self.history: deque[list[float | None]] = deque(maxlen=round(SPAN * RATE))
         self._changed = asyncio.Condition()
         self.scene: dict[str, Any] = {}
@@ -81,7 +85,12 @@ class LiveReader:
 class RecordedReader:
     """Frames of a recording for one reader, with those of another if it is compared."""
 
-    def __init__(self, recording: ShownRecording, comparison: Comparison | None = None) -> None:
+    def __init__(
+        self,
+        recording: ShownRecording,
+        comparison: Comparison | None = None,
+        plan: Plan | None = None,
+    ) -> None:
         self._recording, self._comparison = recording, comparison
         self._playback = PagePlayback(recording.duration)
         self._setting = {
@@ -91,6 +100,7 @@ class RecordedReader:
                 'duration': recording.duration,
                 'losses': list(recording.losses),
             },
+            'plan': None if plan is None else planned(plan),
         }
         self._scene: dict[str, Any] | None = None
         self._due = monotonic()

@@ -6,6 +6,7 @@ from math import isfinite, sqrt
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray
+from needle_planning.plan import Plan
 from needle_ros import contract
 from needle_ros.errors import printable
 from needle_ros.files import DocumentError, read_document
@@ -163,6 +164,23 @@ def signal_of(name: str, topics: Container[str]) -> Signal:
     """Return a signal of `SIGNALS`; without a force sensor, the effort is the force."""
     signal = SIGNALS[name]
     return EFFORT if name == 'force' and signal.topic not in topics else signal
+
+
+def planned(plan: Plan) -> dict[str, Any]:
+    """
+    Return the plan for the page, in ``needle_entry`` [m].
+
+    ``path``: columns x, y and z of the tip at each depth. ``free``: radius around each point that
+    is free of obstacles and their margins, also interpolated: the clearance of a step is that of
+    the whole shaft, so it is a lower bound at the tip.
+    """
+    # The clearance in the step to a depth also bounds the start of the step.
+    clearances = np.minimum(plan.clearances, np.append(plan.clearances[1:], np.inf))
+    path = (plan.path - plan.entry) @ plan.axes.T
+    return {
+        'path': [[round(value, 6) for value in column] for column in path.T.tolist()],
+        'free': [round(float(value), 6) for value in plan.radius + clearances],
+    }
 
 
 def line(points: FloatArray) -> list[list[float]]:

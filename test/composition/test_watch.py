@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from functools import partial
 import json
 from math import inf, nan
@@ -35,6 +36,7 @@ from needle_ros.status import ControllerStatus, SteeringStatus
 from needle_ros.wire import read_line, Reading
 import numpy as np
 import pytest
+from support.anatomies import plan_of
 from support.installed import ROOT
 from support.samples import EPOCH, simulated, write_bag
 from support.watched import (
@@ -751,6 +753,43 @@ async def test_slow_reader_skips_frames() -> None:
         assert page.made[0].number == 2
         with pytest.raises(asyncio.TimeoutError):
             await slow.receive(0.05)
+
+
+def test_plan_is_shown_in_the_frame_of_the_needle(watched: Path) -> None:
+    """In any direction: along y from the entry point, with the clearance around it."""
+    direction = np.array([0.48, -0.6, 0.64])
+    plan = replace(
+        plan_of(np.array([0.1, -0.2, 0.3]), direction),
+        clearances=1e-3 * np.array([5.0, 3.0, 4.0, 1.0, 1.0, 2.0, 6.0]),
+    )
+    side = plan.axes[0]
+    plan = replace(plan, path=plan.path + np.outer(np.linspace(0.0, 2e-3, 7), side))
+    live = Live(View(), lambda _: None, control=False, plan=plan)
+    reader = RecordedReader(ShownRecording(watched), None, plan)
+    first = json.loads(asyncio.run(asyncio.wait_for(reader.next(), 60.0)))
+    for shown in (live.setting['plan'], first['setting']['plan']):
+        x, y, z = shown['path']
+        # Written to a micrometer.
+        np.testing.assert_allclose(x, np.linspace(0.0, 2e-3, 7), atol=6e-7)
+        np.testing.assert_allclose(y, plan.depths, atol=6e-7)
+        np.testing.assert_allclose(z, 0.0, atol=6e-7)
+        free = np.array(shown['free']) - plan.radius
+        # At both ends of each step, and as large as possible.
+        both = np.maximum(free[1:], free[:-1])
+        assert (both <= plan.clearances[1:] + 6e-7).all()
+        np.testing.assert_allclose(free, 1e-3 * np.array([3, 3, 1, 1, 1, 2, 6]), atol=6e-7)
+    assert Live(View(), lambda _: None, control=False).setting['plan'] is None
+
+
+def test_wrong_plan_is_one_line(
+    watched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / 'plan.yaml').write_text('plan: 7')
+    for name, message in (('plan.yaml', 'is not a plan of format 1'), ('no', 'cannot be read')):
+        assert cli.main(['watch', str(watched), '--plan', str(tmp_path / name)]) == 2
+        line = capsys.readouterr().err
+        assert message in line
+        assert len(line.splitlines()) == 1
 
 
 @in_loop

@@ -16,7 +16,10 @@ from typing import Any
 from aiohttp import ClientSession, ClientWebSocketResponse
 from needle_insertion.watch.view import View
 from needle_insertion.watch.watch_node import WatchNode
+from needle_planning import write_plan
+import numpy as np
 import pytest
+from support.anatomies import plan_of
 from support.installed import ROOT
 from support.ros_graph import RosGraph
 from support.watched import write_watched
@@ -374,6 +377,34 @@ def test_browser_plays_a_recording(tmp_path: Path, width: int) -> None:
 
     with watching(dict(os.environ), str(tmp_path / 'bag')) as (running, url):
         asyncio.run(look(running, url))
+
+
+@needs_browser
+def test_browser_draws_a_plan(tmp_path: Path) -> None:
+    """The planned path and its free space, with their line in the legend."""
+    write_watched(tmp_path / 'bag')
+    plan = plan_of(np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    write_plan(plan, tmp_path / 'plan.yaml')
+
+    async def look(url: str) -> None:
+        async with browser() as tab:
+            seen = await shown(tab, url, 400, tmp_path / 'page.png')
+            assert seen['overflow'] == 0
+            assert 'planned path of the tip, and its free space' in seen['text']
+            # The same frame with and without the plan.
+            same = await tab.run(
+                "(() => { const one = document.getElementById('needle'), seen = [], at = frame; "
+                'for (const plan of [drawing.plan, drawing.plan, null]) { drawing.plan = plan; '
+                "drawing.draw(scene, at); seen.push(one.getContext('2d').getImageData(0, 0, "
+                'one.width, one.height).data.join()) } '
+                'return [seen[0] === seen[1], seen[1] === seen[2]] })()'
+            )
+            assert same == [True, False]
+            assert tab.faults == []
+
+    words = str(tmp_path / 'bag'), '--plan', str(tmp_path / 'plan.yaml')
+    with watching(dict(os.environ), *words) as (_, url):
+        asyncio.run(look(url))
 
 
 @needs_browser

@@ -83,6 +83,7 @@ const needleDrawing = (() => {
       this.canvas = canvas;
       /* Limits only grow, so that the picture does not jump. */
       this.lateral = 1;  /* lateral scale over the scale of the depth */
+      this.plan = null;  /* path of the tip and free space around it */
       this.reset();
     }
 
@@ -106,6 +107,7 @@ const needleDrawing = (() => {
       line(frame.needle);
       line(frame.path);
       line(frame.other);
+      line(this.plan && this.plan.path);
       for (const at of [frame.target, frame.expected && frame.expected.at]) {
         if (!at) continue;
         if (at[1] !== null) depths.push(mm(at[1]));
@@ -213,10 +215,23 @@ const needleDrawing = (() => {
       if (axis === 0) label(pen, 'entry', across(0) - 6, top + 13, COLORS.entry, 'right');
     }
 
+    /* Planned path of the tip, and the space around it that is free of obstacles and margins. */
+    planned(pen, {axis, across, up}, {path, free}) {
+      const edge = (sign) => path[1].map((y, k) => [across(y), up(path[axis][k] + sign * free[k])]);
+      const [above, below] = [edge(1), edge(-1)];
+      pen.fillStyle = 'rgba(0, 105, 79, 0.12)';
+      pen.beginPath();
+      [...above, ...below.slice().reverse()].forEach(([x, y], k) => (k ? pen.lineTo(x, y) : pen.moveTo(x, y)));
+      pen.fill();
+      for (const side of [above, below]) stroke(pen, COLORS.expected, 1.2, [2, 3], side);
+      stroke(pen, COLORS.expected, 2, [9, 3, 2, 3], path[1].map((y, k) => [across(y), up(path[axis][k])]));
+    }
+
     content(pen, plane, frame) {
       const {axis, middle, half, across, up} = plane;
       const points = (line) => line[1].map((y, k) => [across(y), up(line[axis][k])]);
       const target = frame.target, expected = frame.expected;
+      if (this.plan) this.planned(pen, plane, this.plan);
       /* Needle of another recording. */
       if (frame.other) stroke(pen, COLORS.tip, 2.5, [2, 5], points(frame.other));
       if (frame.needle && frame.needle.length) {

@@ -291,6 +291,8 @@ function take(message) {
 
 function settle(given) {
   setting = given;
+  drawing.plan = setting.plan;
+  for (const part of document.querySelectorAll('.plan')) part.parentElement.hidden = !setting.plan;
   drawing.reset();
   find('playback').hidden = setting.recording === null;
   find('control').hidden = !(setting.control && token);
