@@ -41,6 +41,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='PLAN.yaml',
         help='plan (needle plan -o) whose path and free space are drawn',
     )
+    parser.add_argument(
+        '--anatomy',
+        type=Path,
+        nargs='+',
+        default=[],
+        metavar='SEGMENTATION',
+        help='segmentation of the plan, shown in 3D; needs --plan and --labels',
+    )
+    parser.add_argument('--labels', type=Path, metavar='LABELS.yaml', help='role of each label')
     shift = 'time added to those of OTHER (default: both start to move at the same time)'
     add_quantity(parser, '--shift', 's', shift)
     add_time(parser)
@@ -62,6 +71,9 @@ def run(options: argparse.Namespace) -> int:
         raise ParameterError('--control needs a live insertion: omit --control or the BAG')
     if options.shift is not None and options.other is None:
         raise ParameterError('--shift needs two recordings: add OTHER, or omit --shift')
+    given = bool(options.anatomy), options.labels is not None
+    if any(given) and not (all(given) and options.plan is not None):
+        raise ParameterError('--anatomy needs --plan and --labels, and --labels needs --anatomy')
     plan = None if options.plan is None else read_plan(options.plan)
     # A signal before the page is served, or a second signal at the end, also ends the command.
     with suppress(KeyboardInterrupt):
@@ -82,7 +94,7 @@ async def _recorded(options: argparse.Namespace, plan: Plan | None) -> None:
         print_each('warning', other.losses)
         comparison = compare(recording, other, options.shift)
     readers = partial(RecordedReader, recording, comparison, plan)
-    await _serve(Server(readers, options.host, options.port))
+    await _serve(Server(readers, options.host, options.port, anatomy=_anatomy(options, plan)))
 
 
 async def _live(options: argparse.Namespace, plan: Plan | None) -> None:
@@ -92,7 +104,9 @@ async def _live(options: argparse.Namespace, plan: Plan | None) -> None:
 
     with watching(control=options.control) as (view, poll, control):
         live = Live(view, poll, control=options.control, plan=plan)
-        server = Server(lambda: LiveReader(live), options.host, options.port, control)
+        server = Server(
+            lambda: LiveReader(live), options.host, options.port, control, _anatomy(options, plan)
+        )
         making = asyncio.create_task(live.run())
         try:
             await _serve(server, making)
@@ -100,6 +114,17 @@ async def _live(options: argparse.Namespace, plan: Plan | None) -> None:
             making.cancel()
             with suppress(asyncio.CancelledError):
                 await making
+
+
+def _anatomy(options: argparse.Namespace, plan: Plan | None) -> str:
+    """Return the anatomy for the page as JSON."""
+    if plan is None or not options.anatomy:
+        return 'null'
+    # Imported here: readers of images are optional.
+    from needle_insertion.report.anatomy_view import AnatomyView
+    from needle_planning.labels import read_anatomy
+
+    return AnatomyView('', plan, read_anatomy(options.anatomy, options.labels)).data
 
 
 async def _serve(server: Server, making: asyncio.Task[None] | None = None) -> None:

@@ -11,10 +11,13 @@ from typing import Any, Final
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_insertion.report.insertion import evenly
 from needle_insertion.report.page import Interactive
-from needle_insertion.report.section import Legend
+from needle_insertion.report.section import legend_of
 from needle_insertion.report.surface import Surface, surfaces
 from needle_planning.anatomy import Anatomy
+from needle_planning.chance import Chance
+from needle_planning.clearance import Clearance
 from needle_planning.plan import Plan
+from needle_planning.planned_needle import complete_needle
 import numpy as np
 
 #: Triangles of all structures, 13 bytes of the page each, and of one structure.
@@ -22,6 +25,7 @@ _TRIANGLES: Final = 48_000
 _MOST, _LEAST = 12_000, 60
 _STRUCTURES: Final = 400  #: Most structures that are drawn; obstacles are first.
 _POINTS: Final = 60  #: Points of a needle.
+_OUTSIDE: Final = 0.015  #: Length of the needle before the entry point [m].
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +35,7 @@ class AnatomyView(Interactive):
     caption: str
     plan: Plan
     anatomies: Sequence[Anatomy]
-    legend: Legend
-    needle: FloatArray  #: points of the complete needle in patient coordinates [m], shape (k, 3)
-    clearances: FloatArray  #: clearance of each point [m], shape (k,)
-    inserted: FloatArray  #: inserted needles in patient coordinates [m], shape (m, p, 3)
-    success: Sequence[bool]  #: whether each of them succeeds
+    chance: Chance | None = None  #: simulated insertions
 
     @property
     def scripts(self) -> Sequence[str]:
@@ -43,22 +43,28 @@ class AnatomyView(Interactive):
 
     @property
     def content(self) -> Mapping[str, Any]:
-        structures, unit = _structures(self.anatomies, self.legend, self.plan)
-        some = evenly(range(len(self.needle)), min(_POINTS, len(self.needle)))
+        plan, chance = self.plan, self.chance
+        structures, unit = _structures(self.anatomies, plan)
+        whole = complete_needle(plan, _OUTSIDE)
+        needle = whole[evenly(range(len(whole)), min(_POINTS, len(whole)))]
+        clearance = Clearance(self.anatomies, needle, radius=plan.radius)
         return {
             'unit': unit,
-            'entry': _rounded(self.plan.entry),
-            'target': _rounded(self.plan.target),
+            'entry': _rounded(plan.entry),
+            'target': _rounded(plan.target),
+            'axes': plan.axes.tolist(),
             'structures': structures,
             'needle': {
-                'points': _rounded(self.needle[some]),
-                'radius': _rounded(self.plan.radius),
-                'clearance': _rounded(self.clearances[some]),
+                'points': _rounded(needle),
+                'radius': _rounded(plan.radius),
+                'clearance': _rounded(clearance.at(needle)),
             },
             'inserted': [
-                {'points': _rounded(line), 'success': success}
-                for line, success in zip(self.inserted, self.success, strict=True)
-            ],
+                {'points': _rounded(line), 'success': bool(chance.values['success'][k])}
+                for k, line in enumerate(chance.shafts)
+            ]
+            if chance is not None
+            else [],
         }
 
 
@@ -67,10 +73,9 @@ def _rounded(lengths: FloatArray | float) -> Any:
     return (np.round(1e3 * np.asarray(lengths), 2) + 0.0).tolist()
 
 
-def _structures(
-    anatomies: Sequence[Anatomy], legend: Legend, plan: Plan
-) -> tuple[list[dict[str, Any]], float]:
+def _structures(anatomies: Sequence[Anatomy], plan: Plan) -> tuple[list[dict[str, Any]], float]:
     """Return the surfaces for the script, and the unit of their coordinates [mm]."""
+    legend = legend_of(anatomies, plan.structure)
     shown = list(enumerate(legend.structures))[:_STRUCTURES]
     most = int(np.clip(_TRIANGLES // max(len(shown), 1), _LEAST, _MOST))
     numbers = {(one.role, one.name): number for number, one in shown}

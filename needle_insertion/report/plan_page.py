@@ -104,15 +104,11 @@ def write_plan_page(
     words = 'Drag to turn, or use the arrow keys. Obstacles are opaque, all else is translucent.'
     if chance is not None and len(shaft.inserted):
         words += f' Lines: {len(shaft.inserted)} of {chance.insertions} simulated insertions.'
-    solid = AnatomyView(
-        words, plan, every, legend, shaft.final, clearance.at(shaft.final), shaft.inserted,
-        shaft.success,
-    )  # fmt: skip
     write_page(
         Path(path),
         'plan.html',
         [*pictures, _by_depth(plan, legend, shaft)],
-        solid,
+        AnatomyView(words, plan, every, chance),
         introduction=f'Needle {plan.needle} from the skin to the target, '
         f'{"bowed by the guide" if bent else "straight"}, in {len(plan.guide)} steps. '
         'Clearances are beyond the margins of the obstacles.',

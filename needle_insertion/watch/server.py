@@ -52,6 +52,10 @@ _FILES: Final = {
     '/watch.css': (_PAGE / 'watch.css', 'text/css'),
     '/charts.js': (_PAGE / 'charts.js', 'text/javascript'),
     '/watch.js': (_PAGE / 'watch.js', 'text/javascript'),
+    **{
+        f'/anatomy.{kind}': (TEMPLATE_FOLDER / f'anatomy.{kind}', f'text/{name}')
+        for kind, name in (('js', 'javascript'), ('css', 'css'))
+    },
     '/needle.js': (TEMPLATE_FOLDER / 'needle.js', 'text/javascript'),
 }
 
@@ -97,6 +101,7 @@ class Server:
         host: str = '127.0.0.1',
         port: int = PORT,
         control: Control | None = None,
+        anatomy: str = 'null',
     ) -> None:
         try:
             self._local = ip_address(host).is_loopback
@@ -115,6 +120,8 @@ class Server:
         self.token = token_urlsafe(24) if control is not None else ''
         self._readers, self._host, self._port = readers, host, port
         self._control = control
+        #: Anatomy and plan in 3D for the page, as JSON.
+        self._anatomy = {'text': anatomy, 'content_type': 'application/json'}
         self._open: set[web.WebSocketResponse] = set()
         self._runner: web.AppRunner | None = None
 
@@ -144,6 +151,7 @@ class Server:
         for path, (file, kind) in _FILES.items():
             content = {'text': file.read_text(encoding='utf-8'), 'content_type': kind}
             app.router.add_get(path, partial(_answer, content))
+        app.router.add_get('/anatomy.json', partial(_answer, self._anatomy))
         app.router.add_get('/frames', self._frames)
         app.on_shutdown.append(self._close)
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)

@@ -280,22 +280,10 @@ def test_page_has_all_numbers_of_the_plan(bowed: Plan, tmp_path: Path) -> None:
     assert all(words and width > 0 for words, width in seen.images)
 
 
-def view_of(plan: Plan, anatomy: Anatomy, chance: Chance) -> AnatomyView:
-    legend = legend_of([anatomy], plan.structure)
-    planes = plan_page._planes(plan, legend)
-    corners = np.concatenate([one.corners for one in planes])
-    clearance = Clearance([anatomy], corners, radius=plan.radius)
-    shaft = plan_page._shaft(plan, clearance, chance)
-    return AnatomyView(
-        '', plan, [anatomy], legend, shaft.final, clearance.at(shaft.final), shaft.inserted,
-        shaft.success,
-    )  # fmt: skip
-
-
 def test_view_has_surfaces_needle_and_insertions(
     straight: Plan, anatomy: Anatomy, chance: Chance
 ) -> None:
-    content = view_of(straight, anatomy, chance).content
+    content = AnatomyView('', straight, [anatomy], chance).content
     middle = 5e2 * (straight.entry + straight.target)
     assert [one['name'] for one in content['structures']] == ['皮膚', '_bone $<1', 'muscle']
     for one in content['structures']:

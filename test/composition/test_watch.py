@@ -792,6 +792,16 @@ def test_wrong_plan_is_one_line(
         assert len(line.splitlines()) == 1
 
 
+@pytest.mark.parametrize('words', [['--anatomy', 'a.nrrd'], ['--labels', 'labels.yaml']])
+def test_anatomy_without_plan_is_one_line(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(['watch', *words]) == 2
+    line = capsys.readouterr().err
+    assert '--anatomy needs --plan and --labels' in line
+    assert len(line.splitlines()) == 1
+
+
 @in_loop
 async def test_live_reader_receives_newest_frame() -> None:
     """A slow reader receives the newest frame, a new reader the history."""

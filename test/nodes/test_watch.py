@@ -408,6 +408,37 @@ def test_browser_draws_a_plan(tmp_path: Path) -> None:
 
 
 @needs_browser
+def test_browser_shows_the_anatomy(tmp_path: Path) -> None:
+    """In 3D, with the needle of the frame where the guide is at the planned pose."""
+    write_watched(tmp_path / 'bag')
+    liver = ROOT / 'examples' / 'liver'
+    files = str(liver / 'liver.seg.nrrd'), '--labels', str(liver / 'labels.yaml')
+    entry, direction = np.array([0.14325, 0.02175, 0.0185]), np.array([-0.8, -0.6, 0.0])
+    write_plan(plan_of(entry, direction), tmp_path / 'plan.yaml')
+
+    async def look(url: str) -> None:
+        async with browser() as tab:
+            await tab.size(400, 1000)
+            await tab.open(url)
+            # Without a graphics card a picture may take a second.
+            await tab.wait('needleWatch.anatomy && needleWatch.anatomy.now.count > 0', 'a needle')
+            await tab.wait("document.getElementById('anatomy').dataset.drawn > 1", 'a picture')
+            wide = 'document.documentElement.scrollWidth - document.documentElement.clientWidth'
+            assert await tab.run(wide) == 0
+            text = await tab.run("document.getElementById('anatomy').innerText")
+            for words in ('ribs (obstacle)', 'liver (tissue)', 'needle now', 'free of margins'):
+                assert words in text
+            # Rows of the axes of the guide: y is the direction.
+            axes = np.array(await tab.run('needleWatch.anatomy.content.axes'))
+            np.testing.assert_allclose(axes[1], direction, atol=1e-12)
+            assert tab.faults == []
+
+    words = str(tmp_path / 'bag'), '--plan', str(tmp_path / 'plan.yaml'), '--anatomy', *files
+    with watching(dict(os.environ), *words) as (_, url):
+        asyncio.run(look(url))
+
+
+@needs_browser
 def test_browser_compares_two_recordings(tmp_path: Path) -> None:
     """Both have values at the cursor, lines of their own, and columns in the table."""
     for name in ('one', 'two'):

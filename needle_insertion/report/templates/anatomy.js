@@ -97,8 +97,8 @@ const needleAnatomy = (() => {
   }
 
   class View {
-    /* Show a content in an element; without WebGL, a line of text. */
-    constructor(box, content) {
+    /* Show a content in an element, with a needle of `show` if it is live; without WebGL, a line of text. */
+    constructor(box, content, live = false) {
       this.box = box;
       this.content = content;
       box.hidden = false;
@@ -114,6 +114,7 @@ const needleAnatomy = (() => {
       this.waiting = false;
       this.most = Math.min(MOST, Math.max(...content.needle.clearance, 1));
       this.prepare();
+      this.now = live ? this.add('needle now', 'needle', rgb(COLORS.needle), tube([], [], [])) : null;
       this.layout();
       this.listen();
       this.look('side');
@@ -150,6 +151,25 @@ const needleAnatomy = (() => {
         const shown = (content.inserted || []).filter((one) => one.success === wanted);
         if (shown.length) this.add(name, 'lines', rgb(color), this.lines(shown.map((one) => one.points)));
       }
+    }
+
+    /* Show the needle of a frame: columns x, y, z in `needle_entry` [m], null if unknown. */
+    show(columns) {
+      const key = JSON.stringify(columns);
+      if (!this.now || key === this.shown) return;
+      this.shown = key;
+      const {gl, now, content} = this, {entry, axes, needle} = content;
+      const line = (columns && columns.length ? columns[1] : []).map((_, k) => this.local(entry.map((one, axis) =>
+        one + 1e3 * (columns[0][k] * axes[0][axis] + columns[1][k] * axes[1][axis] + columns[2][k] * axes[2][axis]))));
+      const {points, normals: directions, triangles} = tube(line, line.map(() => needle.radius), line.map(() => [0, 0, 0]));
+      for (const [kind, buffer, values] of [[gl.ARRAY_BUFFER, now.at, points], [gl.ARRAY_BUFFER, now.normal, directions],
+        [gl.ELEMENT_ARRAY_BUFFER, now.index, triangles]]) {
+        gl.bindBuffer(kind, buffer);
+        gl.bufferData(kind, values, gl.DYNAMIC_DRAW);
+      }
+      now.shades = null;
+      now.count = triangles.length;
+      this.later();
     }
 
     local(at) {

@@ -22,7 +22,7 @@ window.needleWatch = seen;
 
 let socket = null, scene = {limits: {}, tissue: null, steered: false}, setting = null;
 let frame = null, playback = null, waiting = false, worded = 0, drawnAt = 0;
-let other = null, dragging = false, unseen = 0, saying = 0, changed = true;
+let anatomy = null, other = null, dragging = false, unseen = 0, saying = 0, changed = true;
 
 /* Text. */
 
@@ -238,6 +238,7 @@ function say() {
   tellShape();
   tellCursor();
   charts.draw(frame.time, scene.limits);
+  if (anatomy) anatomy.show(frame.needle);
   if (playback) tellPlayback();
 }
 
@@ -376,6 +377,11 @@ function connect() {
     setTimeout(connect, 1000);
   });
 }
+
+/* The surfaces come once; null without an anatomy. */
+fetch('anatomy.json').then((answer) => answer.json()).then((content) => {
+  if (content) seen.anatomy = anatomy = new needleAnatomy.View(find('anatomy'), content, true);
+});
 
 new ResizeObserver(() => frame && later()).observe(document.querySelector('main'));
 connect();
