@@ -37,6 +37,7 @@ class SimulatedInsertion(NamedTuple):
     bow: float  #: largest deflection of the shaft from the line [m]
     slope: float  #: largest slope of the shaft relative to the line
     load: float  #: largest lateral force on the guide along an axis [N]
+    skin: float  #: largest sideways displacement at the skin along an axis [m]
 
 
 def simulate_insertion(
@@ -75,16 +76,17 @@ def simulate_insertion(
     one = SteeredNeedle(needle, replace(steering, path_noise=0.0), roll=roll)
     along = np.append(np.arange(0.0, depths[-1] - 0.5 * _CHECKED, _CHECKED), depths[-1])
     tips, loads, slope = [one.tip[[0, 2]]], [0.0], 0.0
-    sag = 0.0
+    sag = skin = 0.0
     shapes: list[FloatArray] = []
     steps: list[int] = []
 
     def keep(step: int) -> None:
-        nonlocal slope, sag
+        nonlocal slope, sag, skin
         # Points ahead of the tip are at the tip.
         points = np.minimum(along, one.depth)
         deflections, slopes = inserted_shape(one, points)
         slope = max(slope, float(np.hypot(*slopes.T).max()))
+        skin = max(skin, float(np.abs(deflections[0]).max()))
         sag = max(sag, sag_of(slopes[along <= one.depth], _CHECKED))
         shapes.append(line.points(points, deflections))
         steps.append(step)
@@ -121,6 +123,7 @@ def simulate_insertion(
         bow=bow,
         slope=slope,
         load=max(loads),
+        skin=skin,
     )
 
 

@@ -29,6 +29,10 @@ import numpy as np
 #: relative error grows with the square of the slope.
 STEEPEST: Final = 0.1
 
+#: Largest sideways displacement of a planned needle at the skin, along x and along z [m]. An
+#: assumption: 1.6 diameters of a needle of 18 gauge.
+SKIN_LIMIT: Final = 2e-3
+
 _SAME: Final = 1e-9  #: Tolerance of equal depths [m].
 _UNIT: Final = 1e-3  #: Guide motion of a computed response [m].
 _POINTS: Final = 4e-3  #: Distance of the points of the shaft in the linear programs [m].
@@ -208,7 +212,13 @@ class _Program:
     """Linear constraints on the guide setpoints, equal in x and z but for the bevel."""
 
     def __init__(
-        self, responses: PathResponses, limits: SteeringLimits, roll: float, *, slopes: bool = True
+        self,
+        responses: PathResponses,
+        limits: SteeringLimits,
+        roll: float,
+        skin_limit: float,
+        *,
+        slopes: bool = True,
     ) -> None:
         from scipy.sparse import csr_array, eye_array, vstack
 
@@ -218,9 +228,11 @@ class _Program:
         rows, offsets, most = [self.change], [np.zeros(n)], [np.full(n, limits.guide_step)]
         # Each plane has an equal part of the largest slope; every fourth point is enough.
         some = np.union1d(np.arange(0, len(r.rows), 4), r.last)[: None if slopes else 0]
-        rows += [r.loads, r.slopes[some]]
-        offsets += [r.loads_bevel, r.slopes_bevel[some]]
-        most += [np.full(n, limits.load_limit), np.full(len(some), STEEPEST / sqrt(2.0))]
+        skin = np.flatnonzero(r.rows == 0.0)
+        rows += [r.loads, r.shaft[skin], r.slopes[some]]
+        offsets += [r.loads_bevel, r.shaft_bevel[skin], r.slopes_bevel[some]]
+        most += [np.full(n, limits.load_limit), np.full(len(skin), skin_limit)]
+        most += [np.full(len(some), STEEPEST / sqrt(2.0))]
         matrix, offset, bound = (
             csr_array(vstack(rows)),
             np.concatenate(offsets),
@@ -319,7 +331,11 @@ def _linear_program(
 
 
 def bow_profile(
-    responses: PathResponses, limits: SteeringLimits, roll: float, parts: int
+    responses: PathResponses,
+    limits: SteeringLimits,
+    roll: float,
+    parts: int,
+    skin_limit: float = SKIN_LIMIT,
 ) -> FloatArray:
     """
     Return the largest deflection of any path at equal fractions of a line, from entry to target.
@@ -330,7 +346,7 @@ def bow_profile(
     deflection is at most the linear interpolation. Shape (parts + 1,) [m].
     """
     # Without the limit of the slope, which changes the bound by a few percent.
-    program, r = _Program(responses, limits, roll, slopes=False), responses
+    program, r = _Program(responses, limits, roll, skin_limit, slopes=False), responses
 
     def largest(row: int) -> float:
         found = 0.0
@@ -370,6 +386,7 @@ def best_bow(
     responses: PathResponses,
     limits: SteeringLimits,
     roll: float = 0.0,
+    skin_limit: float = SKIN_LIMIT,
 ) -> BowedNeedle | None:
     """
     Maximize the least clearance of the shaft at all depths, from several first bows.
@@ -386,6 +403,8 @@ def best_bow(
         Limits of guide position, guide motion and lateral load.
     roll : float
         Roll of the needle [rad].
+    skin_limit : float
+        Largest sideways displacement of the shaft at the skin, along x and along z [m].
 
     Returns
     -------
@@ -393,7 +412,7 @@ def best_bow(
         A local optimum; None if no guide setpoints bring the tip to the target.
 
     """
-    program = _Program(responses, limits, roll)
+    program = _Program(responses, limits, roll, skin_limit)
     x, _, z = line.axes
     lateral = np.stack([x, z])
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Final, TypeAlias
 
 from needle_controller.steering.settings import SteeringLimits
@@ -19,6 +20,7 @@ from needle_planning.paths import (
     Line,
     needle_radius,
     path_responses,
+    SKIN_LIMIT,
     STEEPEST,
     step_depths,
 )
@@ -63,6 +65,7 @@ def find_plan(
     needle: str = DEFAULT_NEEDLE,
     limits: SteeringLimits | None = None,
     roll: float = 0.0,
+    skin_limit: float = SKIN_LIMIT,
     bow: bool = True,
     resolution: float = 5e-4,
     progress: Callable[[str], object] | None = None,
@@ -87,6 +90,9 @@ def find_plan(
         Step length, and limits of guide position, guide motion and lateral load.
     roll : float
         Roll of the needle [rad].
+    skin_limit : float
+        Largest sideways displacement of the needle at the skin by the guide, along x and along
+        z [m]; inf: no limit.
     bow : bool
         Whether the guide may bow the needle where this increases the clearance.
     resolution : float
@@ -128,7 +134,15 @@ def find_plan(
     """
     every = [anatomy] if isinstance(anatomy, Anatomy) else list(anatomy)
     planner = _Planner(
-        every, target, entry, entry_radius, needle, limits or SteeringLimits(), roll, resolution
+        every,
+        target,
+        entry,
+        entry_radius,
+        needle,
+        limits or SteeringLimits(),
+        roll,
+        skin_limit,
+        resolution,
     )
     return planner.plan(bow, progress or (lambda _: None))
 
@@ -145,12 +159,15 @@ class _Planner:
         needle: str,
         limits: SteeringLimits,
         roll: float,
+        skin_limit: float,
         resolution: float,
     ) -> None:
         self.target = _point('target', target)
         if not is_number(resolution) or not resolution >= _FINEST:
             raise ParameterError(f'resolution must be >= {_FINEST:g} m, got {resolution!r}')
-        self.name, self.limits, self.roll = needle, limits, roll
+        if not (is_number(skin_limit) or skin_limit == inf) or skin_limit < 0.0:
+            raise ParameterError(f'skin_limit must be >= 0 m, got {skin_limit!r}')
+        self.name, self.limits, self.roll, self.skin_limit = needle, limits, roll, skin_limit
         self.resolution = float(resolution)
         self.preset = _usable(needle)
         self.radius = needle_radius(self.preset.needle)
@@ -263,7 +280,8 @@ class _Planner:
         for length in np.linspace(shortest, longest, count).tolist():
             progress(f'largest bow at {1e3 * length:.0f} mm')
             responses = path_responses(needle, steering, length, self.limits.step_length)
-            found = np.maximum(found, bow_profile(responses, self.limits, self.roll, _PARTS))
+            profile = bow_profile(responses, self.limits, self.roll, _PARTS, self.skin_limit)
+            found = np.maximum(found, profile)
         return _MORE * found
 
     def _candidates(self, *searches: Lines) -> list[FloatArray]:
@@ -298,13 +316,16 @@ class _Planner:
             line = self._line(entry)
             length = float(np.linalg.norm(self.target - entry))
             responses = path_responses(needle, steering, length, self.limits.step_length)
-            bow = best_bow(self.clearance, line, responses, self.limits, self.roll)
+            bow = best_bow(
+                self.clearance, line, responses, self.limits, self.roll, self.skin_limit
+            )
             if bow is None or bow.clearance <= least:
                 continue
             depths, found = self._insert(line, bow.guide)
             off = float(np.linalg.norm(found.path[-1] - self.target))
             valid = off <= _OFF and found.slope <= _LINEAR * STEEPEST
             valid &= found.load <= _LINEAR * self.limits.load_limit
+            valid &= found.skin <= _LINEAR * self.skin_limit
             if found.clearance > least and valid:
                 chosen, least = (line, bow.guide, depths, found), found.clearance
         return chosen
@@ -400,6 +421,11 @@ def _region(
         found += [] if region is None else [region]
     if len(found) > 1:
         raise ParameterError('the entry region must be in one image: name its structure')
+    if found and not len(found[0].centers):
+        raise ParameterError(
+            'only a face of the image ends the entry region, which continues there: extend the '
+            'image or the region'
+        )
     if not found:
         raise ParameterError(
             f'no voxel belongs to the entry region {entry or "(role entry)"}: give an entry point'

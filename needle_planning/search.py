@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import product
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
@@ -53,7 +54,8 @@ def voxel_region(anatomy: Anatomy, labels: list[int], target: FloatArray) -> Ent
     """
     Return the voxels with some labels, None without any.
 
-    Of a thick region only the side away from the target counts.
+    Of a thick region only the side away from the target counts. Where a face of the image cuts
+    the region, no needle enters: there it is deeper along the normal of the face than it is wide.
     """
     inside = np.zeros_like(anatomy.labels, dtype=np.bool_)
     for label in labels:
@@ -73,11 +75,51 @@ def voxel_region(anatomy: Anatomy, labels: list[int], target: FloatArray) -> Ent
     following = index + np.round(np.divide(way, size, where=size > 0.0, out=way)).astype(int)
     shape = np.array(inside.shape)
     there = ((following >= 0) & (following < shape)).all(axis=1)
+    left = _left_through_cut_faces(inside, index, following, way, frame.spacing)
     there[there] = inside[tuple(following[there].T)]
     # The voxel of the target would continue with itself.
     there &= (following != index).any(axis=1)
     halves = (0.5 * frame.axes * frame.spacing).T
-    return EntryRegion(frame.to_patient(centers[~there]), halves, frame)
+    return EntryRegion(frame.to_patient(centers[~there & ~left]), halves, frame)
+
+
+def _left_through_cut_faces(
+    inside: BoolArray, index: IntArray, following: IntArray, way: FloatArray, spacing: FloatArray
+) -> BoolArray:
+    """Return whether the way to the following voxel leaves the image where it cuts the region."""
+    shape, found = np.array(inside.shape), np.zeros(len(index), dtype=np.bool_)
+    # The way leaves a voxel along its largest component first.
+    first = np.abs(way).argmax(axis=1)
+    along = np.arange(3) == first[:, np.newaxis]
+    next_one = np.where(along, following, index)
+    inner = next_one.clip(0, shape - 1)
+    leaves = (next_one != inner).any(axis=1)
+    within = inside[tuple(inner.T)]
+    for axis, end in product(range(3), (-1, 1)):
+        out = (following[:, axis] == (-1 if end < 0 else shape[axis])) & within
+        out &= (first == axis) | ~leaves
+        if out.any():
+            others = np.delete(inner[out], axis, axis=1)
+            found[out] |= _cut_face(inside, axis, end, spacing)[tuple(others.T)]
+    return found
+
+
+def _cut_face(inside: BoolArray, axis: int, end: int, spacing: FloatArray) -> BoolArray:
+    """Return where a face (axis, side -1 or 1) cuts a region of voxels, shape of the face."""
+    inward = np.moveaxis(inside, axis, 0)[:: -end]
+    face, sizes = inward[0], np.delete(spacing, axis)
+    depth = np.full(face.shape, len(inward))
+    np.copyto(depth, inward.argmin(axis=0), where=~inward.all(axis=0))
+    width = np.minimum(_runs(face) * sizes[0], _runs(face.T).T * sizes[1])
+    return np.asarray(face & (depth * spacing[axis] > width))
+
+
+def _runs(face: BoolArray) -> IntArray:
+    """Return the number of voxels of the run along the first axis that contains each voxel."""
+    # Each change of the value begins a new run.
+    change = np.diff(face, axis=0, prepend=~face[:1])
+    number = np.cumsum(change, axis=0) + np.arange(face.shape[1]) * (len(face) + 1)
+    return np.asarray(np.bincount(number.ravel())[number])
 
 
 def disc_region(point: FloatArray, radius: float, target: FloatArray) -> EntryRegion:

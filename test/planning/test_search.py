@@ -314,6 +314,54 @@ def test_far_side_of_a_thick_entry_region_counts() -> None:
     assert outside.sum() == 1600
 
 
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_needle_does_not_enter_through_a_cut_face(axis: int) -> None:
+    """
+    A layer that ends at a side of the image is entered from above only, in any orientation.
+
+    The target is low and far from the side, so that lines through the side leave the layer there.
+    """
+    labels = np.zeros((30, 30, 20), dtype=np.int16)
+    labels[:, :, 16:19] = ENTRY
+    target = np.array([2.0, 15.0, 14.0])
+    order = np.roll([0, 1, 2], axis)
+    anatomy = replace(
+        window(), labels=labels.transpose(order), to_patient=affine([2e-3] * 3)
+    )
+    region = voxel_region(anatomy, [ENTRY], 2e-3 * target[order])
+    assert region is not None
+    index = np.round(region.centers / 2e-3).astype(int)[:, np.argsort(order)]
+    away = np.abs(index - target)
+    # The line leaves the image through its nearest side: the layer continues beyond it.
+    sides = np.isin(index[:, :2], [0, 29]) & (away[:, :2] >= 2.0 * away[:, 2:])
+    assert not sides.any()
+    # Above the target the layer counts as before.
+    assert ((index[:, 2] == 18) & (away[:, :2] < 4.0).all(axis=1)).sum() == 6 * 7
+
+
+@pytest.mark.parametrize('shape', [(20, 20, 3), (1, 1, 1), (7, 30, 2)])
+def test_region_at_the_skin_of_a_cropped_image_counts(shape: tuple[int, int, int]) -> None:
+    """An image may end at the skin: a layer in the plane of a face is entered through the face."""
+    labels = np.zeros((30, 30, 20), dtype=np.int16)
+    labels[: shape[0], : shape[1], 20 - shape[2] :] = ENTRY
+    region = voxel_region(
+        replace(window(), labels=labels, to_patient=affine([2e-3] * 3)),
+        [ENTRY],
+        np.array([0.03, 0.03, 0.0]),
+    )
+    assert region is not None
+    assert np.isclose(region.centers[:, 2], 0.038).sum() == shape[0] * shape[1]
+
+
+def test_region_that_only_a_cut_face_ends_has_no_entry() -> None:
+    """A tube of entry voxels from the target to the border of the image has no outer end."""
+    labels = np.zeros((30, 30, 20), dtype=np.int16)
+    labels[15, 15, 5:] = ENTRY
+    anatomy = replace(window(), labels=labels, to_patient=affine([2e-3] * 3))
+    with pytest.raises(ParameterError, match='only a face of the image ends the entry region'):
+        find_plan(anatomy, (0.03, 0.03, 0.002), bow=False)
+
+
 def test_disc_covers_its_radius() -> None:
     """Squares around the point, perpendicular to the line to the target."""
     point = np.array([0.01, 0.02, 0.1])
@@ -350,6 +398,7 @@ def cases() -> dict[str, tuple[dict[str, Any], str]]:
         'entry at the target': ({'entry': TARGET}, 'further from the target'),
         'disc': ({'entry': (0.0, 0.0, 0.1), 'entry_radius': -1.0}, 'entry_radius must be >= 0'),
         'resolution': ({'resolution': 0.0}, 'resolution must be >= 0.0001 m, got 0.0'),
+        'skin': ({'skin_limit': np.nan}, 'skin_limit must be >= 0 m, got nan'),
         'needle': ({'needle': 'none'}, "needle must be one of .* got 'none'"),
     }  # fmt: skip
 
