@@ -148,6 +148,7 @@ setup(
         'bench': [
             'mcap-ros2-support>=0.5.6',
             'mujoco>=3.2',
+            'ompl>=2.0.1',
             'psutil>=5.8',
             'pyelastica>=0.3.3',
             *SLICER,

@@ -24,6 +24,7 @@ _TOOLS: Final = {
     'study': ('pyarrow', 'distributed'),
     'environments': ('gymnasium',),
     'learning': ('gymnasium', 'stable-baselines3', 'torch'),
+    'plan': ('ompl',),
 }
 
 

@@ -40,6 +40,7 @@ MODULES = {
     'environments': ('environments', 'policies'),
     'pool': ('pool',),
     'learning': ('learning',),
+    'plan': ('plans',),
 }
 
 #: Extras of a benchmark that needs more than ``bench`` and ``ros``.
@@ -110,6 +111,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     pool = add('pool', help='a study whose workers are killed at random times')
     pool.add_argument('--kills', type=int, metavar='N', help='workers that are killed')
+    plans = add('plan', help='planners in synthetic anatomies, and their plans in the plant')
+    plans.add_argument('--anatomies', type=int, metavar='N', help='number of anatomies')
     for name, about in (
         ('environments', 'speed of the Gymnasium environments, and policies without a model'),
         ('learning', 'laws compared with policies learned by PPO'),

@@ -106,7 +106,7 @@ def _left_through_cut_faces(
 
 def _cut_face(inside: BoolArray, axis: int, end: int, spacing: FloatArray) -> BoolArray:
     """Return where a face (axis, side -1 or 1) cuts a region of voxels, shape of the face."""
-    inward = np.moveaxis(inside, axis, 0)[:: -end]
+    inward = np.moveaxis(inside, axis, 0)[::-end]
     face, sizes = inward[0], np.delete(spacing, axis)
     depth = np.full(face.shape, len(inward))
     np.copyto(depth, inward.argmin(axis=0), where=~inward.all(axis=0))

@@ -16,6 +16,7 @@ from needle_dynamics.needles import DEFAULT_NEEDLE
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import table
+from needle_planning.paths import SKIN_LIMIT
 from needle_planning.plan import Plan, write_plan
 from needle_planning.planner import find_plan
 from needle_ros.errors import ParameterError
@@ -82,6 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
          limits.guide_step),
         ('--load-limit', 'N', 'largest lateral force on the guide (default 8N)',
          limits.load_limit),
+        ('--skin-limit', 'm', 'largest displacement of the needle at the skin (default 2mm)',
+         SKIN_LIMIT),
         ('--roll', 'rad', 'roll of the needle (default 0)', 0.0),
         ('--resolution', 'm', 'resolution of the search (default 0.5mm)', 5e-4),
     ):  # fmt: skip
@@ -151,6 +154,7 @@ def run(options: argparse.Namespace) -> int:
             needle=options.needle,
             limits=limits,
             roll=options.roll,
+            skin_limit=options.skin_limit,
             bow=not options.straight,
             resolution=options.resolution,
             progress=show,

@@ -43,6 +43,7 @@ def test_plan_of_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ((f'--target={TARGET}', '--entry=-1,0,0,2'), 2, '--entry must be R,A,S, such as'),
         ((f'--target={TARGET}', '--entry', '0.3,0,0'), 2, 'is too short: the nearest entry'),
         ((f'--target={TARGET}', '--needle', 'none'), 2, 'needle must be one of'),
+        ((f'--target={TARGET}', '--skin-limit=-1mm'), 2, 'skin_limit must be >= 0 m'),
         ((f'--target={TARGET}', '-o', '/none/plan.yaml'), 2, 'its folder does not exist'),
         ((f'--target={TARGET}', '--page', '/none/plan.html'), 2, 'its folder does not exist'),
     ],

@@ -325,9 +325,7 @@ def test_needle_does_not_enter_through_a_cut_face(axis: int) -> None:
     labels[:, :, 16:19] = ENTRY
     target = np.array([2.0, 15.0, 14.0])
     order = np.roll([0, 1, 2], axis)
-    anatomy = replace(
-        window(), labels=labels.transpose(order), to_patient=affine([2e-3] * 3)
-    )
+    anatomy = replace(window(), labels=labels.transpose(order), to_patient=affine([2e-3] * 3))
     region = voxel_region(anatomy, [ENTRY], 2e-3 * target[order])
     assert region is not None
     index = np.round(region.centers / 2e-3).astype(int)[:, np.argsort(order)]
