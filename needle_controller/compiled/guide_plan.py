@@ -9,8 +9,9 @@ from typing import Final, NamedTuple, TYPE_CHECKING
 from needle_controller.compiled.hypotheses import (
     BEVEL,
     constant_mean,
-    CONSTANTS,
+    constants,
     HARD,
+    layered_shift,
     LONG,
     Steering,
     STEP,
@@ -275,7 +276,7 @@ def _guide_load(c: Steering, w: FloatArray) -> tuple[complex, float]:
     if c.load_limit == inf:
         return force, stiffness
     for i in range(len(w)):
-        load, g = c.mean[i, len(c.path) + CONSTANTS + k], i % len(r.guide_load)
+        load, g = c.mean[i, len(c.path) + constants(c) + k], i % len(r.guide_load)
         for j in range(k):
             load += r.guide_load[g, k, j] * c.guide[j]
         push = 0j
@@ -303,6 +304,7 @@ def _follow(c: Steering, w: FloatArray) -> complex:
             for j in range(k, at):
                 shift += r.guide[g, at, j]
                 shift += long * r.between[0, g, at, j] + hard * r.between[1, g, at, j]
+                shift += layered_shift(c, i, at, j)
             need += w[i] * shift * (line - tip_mean(c, i, form))
             gain += w[i] * (1.0 + _DOUBT) * shift**2
     return now + need / gain

@@ -4,11 +4,12 @@ Hypotheses of the steering controller: state, and update by tip measurements.
 
 By hypothesis the tip at depth number k is :math:`z_k = a_k \cdot b + f_k + y_k \cdot \psi` with
 the positions b of the guide, x + i z, the tip :math:`f_k` by origin, frame, tilt and path, and
-four constants :math:`\psi`, whose factors :math:`y_k` depend on past motion: load of the bevel,
-position between two bending lengths and between two skins, and slow error of the sensor. The state
-is :math:`(f_0, ..., f_n, \psi)`: a measurement contains five entries of it, and a tip that has
-been passed is no longer updated. If the load of the guide is limited, the state includes the
-forces on the guide by origin, frame, tilt and path.
+constants :math:`\psi`, whose factors :math:`y_k` depend on past motion: load of the bevel,
+position between two bending lengths and between two skins, stiffness of each layer with an
+uncertainty of its own, and slow error of the sensor. The state is :math:`(f_0, ..., f_n, \psi)`:
+a measurement contains one tip and the constants, and a tip that has been passed is no longer
+updated. If the load of the guide is limited, the state includes the forces on the guide by origin,
+frame, tilt and path.
 
 With the mean :math:`\bar\theta` of the state and its covariance P, a tip :math:`x \cdot \theta`
 has the covariance :math:`s = P \bar x` with the state, and the variance :math:`x \cdot s`. A tip
@@ -36,9 +37,8 @@ from __future__ import annotations
 from math import exp, inf, isfinite, log
 from typing import Final, NamedTuple, TYPE_CHECKING
 
+from needle_controller.compiled.hypothesis_model import HypothesisResponses, StatePrior
 from needle_dynamics.arrays import (
-    Array3,
-    Array4,
     ComplexArray,
     ComplexArray3,
     ComplexMatrix,
@@ -57,9 +57,9 @@ if TYPE_CHECKING:
 _BEVEL_RELEASE: Final = 0.03  #: Standard deviation of the relative loss of the bevel load at rest.
 
 #: Constants after the tips of the state: load of the bevel [N], position between two bending
-#: lengths and between two skins, and slow error of the sensor [m].
-BEVEL, LONG, HARD, SLOW = range(4)
-CONSTANTS: Final = 4
+#: lengths and between two skins; then the logarithm of the stiffness of each layer relative to the
+#: hypothesis, and as the last one the slow error of the sensor [m].
+BEVEL, LONG, HARD, LAYERS = range(4)
 
 #: Standard deviation of a gross error of a tip measurement along each axis [m]: organs below the
 #: diaphragm move by 5 to 10 mm.
@@ -93,48 +93,12 @@ _ERRORS, _EVIDENCE, _LAST_X, _LAST_Z = range(4)
 VALID, LOST, FROZEN, OUTLIER = range(4)  #: Result of the check of a tip measurement.
 
 
-class HypothesisResponses(NamedTuple):
-    """Shifts of the tip at each depth, for g points of the grid, and their sums."""
-
-    guide: Array3  #: per position of the guide in each step, shape (g, n + 1, n)
-    #: Per origin [m], turn of the frame [rad], tilt, load of the bevel [N] without roll, and
-    #: curvature of the path at each depth [1/m], shape (g, n + 1, 5 + n).
-    causes: Array3
-    bevel: Array3  #: per load of the bevel [N] on the skin, and in each step, (g, n + 1, n + 1)
-    elastic: Matrix  #: of the resting tip per load of the bevel [m/N], shape (g, n + 1)
-    #: The same for the force on the guide at its position of each step [N], with n rows.
-    guide_load: Array3
-    causes_load: Array3
-    bevel_load: Array3
-    #: Change of `guide` to the next bending length, and to the next skin, shape (2, g, n + 1, n).
-    between: Array4
-    lags: Matrix  #: largest lag of the roll of the tip behind the base [rad], shape (g, n + 1)
-    #: Sums of the absolute values at the last depth: of `guide` from each step on, shape
-    #: (g, n + 1), and of `bevel` from the skin and each step on, shape (g, n + 3).
-    later_guide: Matrix
-    later_bevel: Matrix
-
-
-class StatePrior(NamedTuple):
-    """Prior of the state, for g points of the grid and h hypotheses."""
-
-    #: Covariance of the tips with tips and forces by origin, frame and tilt, and by a path noise
-    #: of 1, shape (g, n + 1, 2 n + 1).
-    known: Array3
-    wandering: Array3
-    #: Standard deviations of the first three constants: load of the bevel [N], and positions in
-    #: units of the grid, shape (3,).
-    deviations: Vector
-    noises: Vector  #: path noise by hypothesis [rad^2/m], shape (h,)
-    drifts: Vector  #: standard deviation of the slow error by hypothesis [m], shape (h,)
-    decay: Vector  #: correlation of the slow error over a step, shape (n,)
-
-
 class Steering(NamedTuple):
     """
     State and limits of a steering controller: h hypotheses, n steps and m entries of the state.
 
-    With a load limit, m is 2 n + 5, else n + 5, and u is the largest number of measurements.
+    With a load limit, m is 2 n + 5, else n + 5, both with one more for each layer with a deviation
+    of its own, and u is the largest number of measurements.
     """
 
     responses: HypothesisResponses
@@ -165,7 +129,7 @@ class TipForm(NamedTuple):
 
     at: int  #: depth number
     shifts: ComplexVector  #: shift by the guide [m], shape (g,)
-    factors: ComplexMatrix  #: factors of the constants, shape (g, 4)
+    factors: ComplexMatrix  #: factors of the constants, shape (g, 4 + layers)
 
 
 class TipDistribution(NamedTuple):
@@ -211,6 +175,12 @@ def times(factor: float, value: complex) -> complex:
 
 
 @inlined
+def constants(c: Steering) -> int:
+    """Return the number of constants in the state; the last one is the slow error."""
+    return len(c.prior.deviations) + 1
+
+
+@inlined
 def _guide_at_rest(c: Steering) -> ComplexArray:
     guide, done = c.guide.copy(), min(c.counts[STEP], len(c.guide))
     if done > 0:
@@ -226,7 +196,7 @@ def tip_form(
     """Return the tip, measured if ``seen`` = 1; 0 at points without a weight above ``least``."""
     r = c.responses
     shifts = np.zeros(len(r.guide), np.complex128)
-    factors = np.zeros((len(r.guide), CONSTANTS), np.complex128)
+    factors = np.zeros((len(r.guide), constants(c)), np.complex128)
     for g in range(len(r.guide)):
         heaviest = 0.0
         for i in range(g, len(w), len(r.guide)):
@@ -243,14 +213,26 @@ def tip_form(
             hard += times(r.between[1, g, at, j], guide[j])
         shifts[g] = shift
         factors[g, BEVEL], factors[g, LONG], factors[g, HARD] = bevel, long, hard
-        factors[g, SLOW] = seen
+        for k in range(LAYERS, constants(c) - 1):
+            for j in range(at):
+                factors[g, k] += times(r.between[k - 1, g, at, j], guide[j])
+        factors[g, -1] = seen
     return TipForm(at, shifts, factors)
 
 
 @inlined
 def constant_mean(c: Steering, i: int, index: int) -> complex:
-    """Return the mean of a constant in a hypothesis: `BEVEL`, `LONG`, `HARD` or `SLOW`."""
+    """Return the mean of a constant in a hypothesis, with an index such as `BEVEL`."""
     return complex(c.mean[i, len(c.path) + index])
+
+
+@inlined
+def layered_shift(c: Steering, i: int, at: int, j: int) -> float:
+    """Return the change of the response to the guide by the estimated stiffness of layers."""
+    g, found = i % len(c.responses.guide), 0.0
+    for k in range(LAYERS, constants(c) - 1):
+        found += constant_mean(c, i, k).real * c.responses.between[k - 1, g, at, j]
+    return float(found)
 
 
 @inlined
@@ -258,7 +240,7 @@ def tip_mean(c: Steering, i: int, form: TipForm) -> complex:
     """Return the mean of the tip in a hypothesis, x + i z [m]."""
     g = i % len(form.shifts)
     mean: complex = form.shifts[g] + c.mean[i, form.at]
-    for j in range(CONSTANTS):
+    for j in range(constants(c)):
         mean += form.factors[g, j] * constant_mean(c, i, j)
     return mean
 
@@ -273,7 +255,8 @@ def _prior_covariance(c: Steering, i: int, at: int, other: int) -> float:
 @inlined
 def _prior_variance(c: Steering, i: int, index: int) -> float:
     """Return the prior variance of a constant in a hypothesis; the slow error is stationary."""
-    deviation = c.prior.drifts[i] if index == SLOW else c.prior.deviations[index]
+    of = c.prior
+    deviation = of.deviations[index] if index < len(of.deviations) else of.drifts[i]
     return float(deviation * deviation)
 
 
@@ -281,7 +264,7 @@ def _prior_variance(c: Steering, i: int, index: int) -> float:
 def _covariance_with_measurement(c: Steering, i: int, k: int, form: TipForm) -> complex:
     """Return the conjugated covariance of the tip with measurement k, before its update."""
     found, g = c.shared[i, k, form.at], i % len(form.shifts)
-    for j in range(CONSTANTS):
+    for j in range(constants(c)):
         found += form.factors[g, j] * c.shared[i, k, len(c.path) + j]
     return complex(found)
 
@@ -297,7 +280,7 @@ def _released(c: Steering, i: int, form: TipForm) -> float:
 def _variance(c: Steering, i: int, form: TipForm) -> float:
     """Return the variance of the tip along each axis in a hypothesis [m^2]."""
     g, found = i % len(form.shifts), _prior_covariance(c, i, form.at, form.at)
-    for j in range(CONSTANTS):
+    for j in range(constants(c)):
         found += _squared(form.factors[g, j]) * _prior_variance(c, i, j)
     for k in range(c.counts[MEASURED]):
         found -= float(c.learned[i, k] * _squared(_covariance_with_measurement(c, i, k, form)))
@@ -322,10 +305,10 @@ def _first(c: Steering) -> int:
 @inlined
 def _covariance_with_state(c: Steering, i: int, form: TipForm, shared: ComplexArray) -> None:
     """Compute the covariance of the tip with the state, from the first depth on, in place."""
-    first, tips, g = _first(c), len(c.path), i % len(form.shifts)
-    for j in range(first, len(shared) - CONSTANTS):
-        shared[j if j < tips else j + CONSTANTS] = _prior_covariance(c, i, form.at, j)
-    for j in range(CONSTANTS):
+    first, tips, g, count = _first(c), len(c.path), i % len(form.shifts), constants(c)
+    for j in range(first, len(shared) - count):
+        shared[j if j < tips else j + count] = _prior_covariance(c, i, form.at, j)
+    for j in range(count):
         shared[tips + j] = form.factors[g, j].conjugate() * _prior_variance(c, i, j)
     for k in range(c.counts[MEASURED]):
         factor = c.learned[i, k] * _covariance_with_measurement(c, i, k, form).conjugate()
@@ -488,7 +471,7 @@ def advance(boxed: Boxed[Steering]) -> None:
     """Advance to the next step: the slow error of the sensor changes."""
     c, k = boxed.value, boxed.value.counts[STEP]
     if k < len(c.prior.decay):
-        slow, decay = len(c.path) + SLOW, c.prior.decay[k]
+        slow, decay = len(c.path) + constants(c) - 1, c.prior.decay[k]
         for i in range(len(c.logs)):
             if c.prior.drifts[i] == 0.0 or c.logs[i] == -inf:
                 continue

@@ -11,7 +11,8 @@ with positions :math:`b_j` of the guide in the steps, and unknown constants :mat
 and rotation of the sensor's frame, tilt, bevel, and a curvature of the path at each depth, linear
 between the depths. A and H depend on the bending length and on the stiffness of the skin, which
 form a grid. A position between two points of the grid is described by two more unknown constants,
-with the difference of A between the points. A hypothesis is a point of the grid with a path noise
+with the difference of A between the points. The logarithm of the stiffness of each layer is one
+more, if the prior has a spread for layers. A hypothesis is a point of the grid with a path noise
 and a slow error of the sensor: a needle, tissue or sensor that differs from the model is
 explained by them. They widen the prediction, and path noise lets each measurement count more. The
 slow error is the last unknown constant. It changes from step to step.
@@ -29,10 +30,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from math import ceil
+from math import ceil, exp
 from typing import Final
 
-from needle_controller.compiled.hypotheses import HypothesisResponses, StatePrior
+from needle_controller.compiled.hypothesis_model import HypothesisResponses, StatePrior
 from needle_controller.steering.settings import SteeringPrior
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.compiled.cutting_needle import Steered
@@ -40,6 +41,7 @@ from needle_dynamics.compiled.superposition import insert_causes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import steered
 from needle_dynamics.steering.parameters import (
+    by_layer,
     longest_element,
     SteeringParameters,
     turning_load,
@@ -74,6 +76,7 @@ _BEYOND: Final = 1.1  #: Half width of the grid over the spread.
 _ELEMENT: Final = 1.25e-3  #: Longest element [m]: good to a few micrometers.
 _SAME: Final = 1e-9  #: Tolerance of equal depths [m].
 _BEVEL: Final = 3  #: Index of the load of the bevel among the causes.
+_LEAST_SPREAD: Final = 1e-3  #: Least half width of a difference over the stiffness of a layer.
 _EVEN: Final = 12.0**-0.5  #: Standard deviation of a uniform distribution over a cell of the grid.
 
 
@@ -141,6 +144,7 @@ class SteeringModel:
                 # The nearest of the points that are not zero becomes the nominal one.
                 skins[1 + np.abs(skins[1:] - nominal).argmin()] = nominal
         grid_lengths, grid_skins = (one.ravel() for one in np.meshgrid(lengths, skins))
+        spreads = _layer_spreads(b, needle.tissue.starts, float(at[-1]))
         # The responses are per load in the layer with the largest load of the bevel.
         loads = tuple(one / most for one in steering.bevel_load) if most else (1.0,)
         unit = replace(steering, element=_ELEMENT, bevel_load=loads, path_noise=0.0)
@@ -149,25 +153,29 @@ class SteeringModel:
         arcs = [(lead, windup) for lead in _LEADS for windup in _WINDUPS if width and most]
         beams, points = len(grid_lengths), len(grid_lengths) + len(arcs)
         arrays: list[FloatArray] = []
+        changes: list[FloatArray] = []
         for i in range(points):
             if progress is not None:
                 progress(i, points)
             if i < beams:
                 stiffness = float(grid_skins[i]) * needle.tissue_stiffness
                 skin = replace(unit, skin_stiffness=stiffness)
-                point = with_lengths(needle, skin, float(grid_lengths[i]))
-                found = _respond(steered(*point), unit, at, rows)
+                point = steered(*with_lengths(needle, skin, float(grid_lengths[i])))
+                found = _respond(point, unit, at, rows)
+                changes.append(_layer_responses(point, unit, rows, spreads))
             else:
                 found = _kinematic(steered(needle, unit), unit, at, arcs[i - beams][0])
             arrays = arrays or [np.empty((points, *one.shape)) for one in found]
             for of_all, one in zip(arrays, found, strict=True):
                 of_all[i] = one
         guide, _, bevel, *_ = arrays
-        between, grid = np.zeros((2, *guide.shape)), (len(skins), len(lengths), n + 1, n)
-        for change, axis in zip(between, (1, 0), strict=True):
+        between = np.zeros((2 + len(spreads), *guide.shape))
+        grid = len(skins), len(lengths), n + 1, n
+        for change, axis in zip(between[:2], (1, 0), strict=True):
             if grid[axis] > 1:
                 whole = np.gradient(guide[:beams].reshape(grid), axis=axis)
                 change[:beams] = whole.reshape(beams, n + 1, n)
+        between[2:, :beams] = np.stack(changes, axis=1)
         lags = np.outer([0.0] * beams + [windup for _, windup in arcs], at)
         later = _sums_from(guide[:, -1], n + 1), _sums_from(bevel[:, -1], n + 3)
         #: Responses at the g points of the grid; hypothesis i has point i modulo g.
@@ -190,7 +198,7 @@ class SteeringModel:
         self.state_prior = StatePrior(
             known=_covariance(causes[:, :, :_BEVEL], known, n + 1),
             wandering=_covariance(causes[:, :, _BEVEL + 1 :], path, n + 1),
-            deviations=np.array([b.bevel, _EVEN, _EVEN]),
+            deviations=np.array([b.bevel, _EVEN, _EVEN, *spreads]),
             noises=np.repeat(kinds[:, 0], points),
             drifts=np.repeat(kinds[:, 1], points),
             decay=np.exp(-np.diff(at) / _DRIFT_LENGTH),
@@ -227,6 +235,35 @@ def _respond(
     # The frame of the sensor has no effect on the force on the guide.
     of_guide = _by_cause(forces[rows.guided], np.zeros(n), np.zeros(n))
     return *of_tip, np.append(elastic, elastic[-1]), *of_guide
+
+
+def _layer_spreads(prior: SteeringPrior, starts: Sequence[float], last: float) -> FloatArray:
+    """Return the spread of each layer that begins above the last depth [m], shape (layers,)."""
+    if not prior.layer_spread:
+        return np.zeros(0)
+    spreads = by_layer('prior.layer_spread', prior.layer_spread, len(starts))
+    return spreads[: int(np.searchsorted(starts, last))]
+
+
+def _layer_responses(
+    base: Steered, steering: SteeringParameters, rows: _Rows, spreads: FloatArray
+) -> FloatArray:
+    """Return the change of the response to the guide per logarithm of the stiffness of layers."""
+    n = len(rows.inserted) - 1
+    guide, loads = np.ascontiguousarray(rows.guide[:, :n]), np.zeros((len(rows.depths), n))
+    found, tips, forces = np.zeros((len(spreads), n + 1, n)), *np.empty((2, *loads.shape))
+    for layer, spread in enumerate(spreads.tolist()):
+        # Over the range of the prior: the response is not linear in it.
+        half = max(spread, _LEAST_SPREAD)
+        for sign in (1.0, -1.0):
+            stiffness = base.stiffness.copy()
+            stiffness[layer] *= exp(sign * half)
+            insert_causes(
+                base.ei, base.skin, steering.free_length, rows.depths, stiffness[rows.layers],
+                np.zeros(n), guide, loads, tips, forces,
+            )  # fmt: skip
+            found[layer] += sign / (2.0 * half) * tips[rows.inserted]
+    return found
 
 
 def _kinematic(

@@ -66,6 +66,11 @@ class SteeringPrior(CheckedSettings):
         0.06, 'm',
         'largest stiffness of the skin relative to that of the tissue; 0: the nominal one',
     )  # fmt: skip
+    layer_spread: tuple[float, ...] = constant(
+        (), '1', 'standard deviation of the logarithm of the stiffness of each layer of tissue, '
+        'independent of other layers and in addition to spread; one value, or one for each layer; '
+        'empty: all layers differ by the same factor', high=2.0,
+    )  # fmt: skip
     tilt: float = constant(0.04, 'rad', 'standard deviation of the tilt of the guide')
     frame: float = constant(
         0.06, 'rad', 'standard deviation of the rotation between the frames of guide and sensor'

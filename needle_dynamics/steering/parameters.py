@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
@@ -130,6 +131,12 @@ def with_lengths(
         ),
         replace(steering, skin_stiffness=steering.skin_stiffness * stiffer * skin),
     )
+
+
+def with_layers(needle: NeedleParameters, factors: Sequence[float]) -> NeedleParameters:
+    """Scale the stiffness of each layer, shape (layers,); the skin does not change."""
+    first, *others = (k * by for k, by in zip(needle.tissue.stiffnesses, factors, strict=True))
+    return replace(needle, tissue_stiffness=first, layer_stiffnesses=tuple(others))
 
 
 def by_layer(name: str, values: tuple[float, ...], layers: int) -> FloatArray:

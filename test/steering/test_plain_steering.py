@@ -14,7 +14,7 @@ from needle_controller import (
     SteeringModel,
     SteeringPrior,
 )
-from needle_controller.compiled.hypotheses import HypothesisResponses
+from needle_controller.compiled.hypothesis_model import HypothesisResponses
 from needle_controller.steering.simulation import sample_truth, simulate_steering
 from needle_dynamics import FloatArray, NEEDLES
 from needle_dynamics.arrays import ComplexArray
@@ -30,20 +30,27 @@ MODELS = {
     bevel: SteeringModel(NEEDLE, replace(STEERING, bevel_load=(bevel,)), DEPTHS)
     for bevel in (0.0, 0.8)
 }
+#: Layers whose stiffness is uncertain by 0.3 and 0.5; the third one is not reached.
+LAYERED = SteeringModel(
+    replace(NEEDLE, layer_depths=(0.04, 0.2), layer_stiffnesses=(4e4, 2e4)),
+    STEERING,
+    DEPTHS,
+    SteeringPrior(layer_spread=(0.3, 0.5, 0.4)),
+)
 
 
 def prior_covariances(model: SteeringModel) -> FloatArray:
-    """Return the prior of all causes by path noise and slow error, shape (9, 8 + n, 8 + n)."""
+    """Return the prior of all causes by path noise and slow error, shape (9, m, m)."""
     prior, cell = model.prior, 1.0 / sqrt(12.0)
     deviations = [prior.offset, prior.frame, prior.tilt, prior.bevel]
-    deviations += [0.0] * (model.steps + 1) + [cell, cell, 0.0]
+    deviations += [0.0] * (model.steps + 1) + [cell, cell, *prior.layer_spread[:2], 0.0]
     drifts = 0.0, prior.drift, 3.0 * prior.drift
     kinds = [(path, drift) for drift in drifts for path in (1.0, 10.0, 100.0)]
     found = np.tile(np.diag(np.square(deviations)), (len(kinds), 1, 1))
     apart = np.abs(np.subtract.outer(model.depths, model.depths)) / prior.path_noise_length
     for covariance, (path, drift) in zip(found, kinds, strict=True):
         variance = path * prior.path_noise / (2.0 * prior.path_noise_length)
-        covariance[4:-3, 4:-3] = variance * np.exp(-apart)
+        covariance[4 : 5 + model.steps, 4 : 5 + model.steps] = variance * np.exp(-apart)
         covariance[-1, -1] = drift**2
     return found
 
@@ -178,7 +185,7 @@ class Plain:
         (means, errors, turned), k, w, r = ends, self.step, self.weights.copy(), self.r
         now, after = r.guide[:, -1, k], r.guide[:, -1, k + 1 :]
         push = (r.bevel_load[:, k] * self.turned).sum(axis=1) * self.mean[:, 3]
-        causes = r.causes_load[:, k] * self.mean[:, :-3]
+        causes = r.causes_load[:, k] * self.mean[:, : 5 + self.model.steps]
         causes[:, 3] = push
         force = w @ (r.guide_load[:, k] @ self.guide + causes.sum(axis=1))
         found, need = np.zeros(tried.shape), self.goal - means
@@ -213,7 +220,7 @@ class Plain:
         w = np.where(w < 1e-4, 0.0, w)
         need, gain = 0j, 2.5e-3
         for at in range(k + 1, min(k + 4, n) + 1):
-            between = np.einsum('hb,bhj->hj', self.mean[:, -3:-1].real, r.between[:, :, at])
+            between = np.einsum('hb,bhj->hj', self.mean[:, 5 + n : -1].real, r.between[:, :, at])
             shift = (r.guide[:, at] + between)[:, k:at].sum(axis=1)
             line = self.goal * DEPTHS[at] / DEPTHS[-1]
             need += (w * shift) @ (line - self.tip(at, self.held())[0])
@@ -314,6 +321,21 @@ def test_a_hundred_insertions_equal_the_plain_formulas(limits: SteeringLimits) -
 
         simulate_steering(law, truth.plant(DEPTHS), sensor)
         assert law.turns == law.plain.turns
+
+
+def test_insertions_into_layers_equal_the_plain_formulas() -> None:
+    """The same motions and estimates, in layers that differ independently; three needles."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        truth = sample_truth(LAYERED.needle, STEERING, TRUE, rng, seed)
+        law = Compared(LAYERED, 2e-3 * rng.uniform(-1.0, 1.0, 2), SteeringLimits())
+        simulate_steering(law, truth.plant(DEPTHS), lambda tip: tip)
+        layers, plain = law.layers, law.plain
+        assert layers.shape == (2, 2)
+        logs = plain.mean[:, -3:-1].real - 4.0 * np.log(LAYERED.lengths)[:, None]
+        mean, own = plain.weights @ logs, plain.covariance[:, [-3, -2], [-3, -2]].real
+        deviation = np.sqrt(plain.weights @ (own + (logs - mean) ** 2))
+        assert_allclose(layers, np.column_stack([np.exp(mean), deviation]), rtol=1e-6)
 
 
 @pytest.mark.parametrize('load_limit', [2.0, inf])

@@ -119,7 +119,7 @@ class MultiHypothesisLaw(SteeringLaw):
         if limit == 0.0 and turns == 0:
             raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
         points, tips, count = len(model.responses.guide), model.steps + 1, len(model.lengths)
-        size = tips + hypotheses.CONSTANTS
+        size = tips + len(model.state_prior.deviations) + 1
         if limits.load_limit < inf:
             size += model.steps
         mean = np.zeros((count, size), dtype=np.complex128)
@@ -178,6 +178,29 @@ class MultiHypothesisLaw(SteeringLaw):
     def bending(self) -> float:
         """Estimated bending length, relative to the nominal one."""
         return float(self.weights @ self._model.lengths)
+
+    @property
+    def layers(self) -> FloatArray:
+        """
+        Estimated stiffness of each layer over its nominal one.
+
+        Median, and standard deviation of its logarithm, shape (layers, 2); the layers are those
+        with a spread in the prior that begin above the last depth.
+        """
+        now, w = self._now, self.weights
+        tips, spreads = len(now.path), now.prior.deviations[hypotheses.LAYERS :]
+        used = w > 0.0
+        own = slice(tips + hypotheses.LAYERS, tips + hypotheses.LAYERS + len(spreads))
+        seen = slice(0, int(now.counts[hypotheses.MEASURED]))
+        known = np.einsum(
+            'hu,huk->hk', now.learned[used, seen], np.abs(now.shared[used, seen, own]) ** 2
+        )
+        # All layers of a hypothesis also differ by its bending length.
+        common = -4.0 * np.log(self._model.lengths[used])[:, np.newaxis]
+        logs, w = now.mean[used, own].real + common, w[used]
+        mean = w @ logs
+        variance = w @ (spreads**2 - known + (logs - mean) ** 2)
+        return np.column_stack([np.exp(mean), np.sqrt(variance)])
 
     def expected(self, at: int = -1) -> TipEstimate:
         """Predict the tip at a depth number, at least `step` - 1, with the last guide and roll."""
