@@ -39,7 +39,7 @@ _ROWS: Final = 1024  #: Most sampled values of each cause.
 _SCENARIO: Final = 'needle_planning.plan_scenario:PlanScenario'
 #: Causes of failure, and the beginnings of their variables; all others are of the sensor.
 CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
-    'needle and tissue': ('bending_length', 'skin', 'bevel_', 'path_noise'),
+    'needle and tissue': ('bending_length', 'skin', 'layer_', 'bevel_', 'path_noise'),
     'entry pose': ('entry_', 'frame_', 'tilt_'),
     'registration': ('registration_', 'rotation_'),
     'target motion': ('target_',),
@@ -187,7 +187,7 @@ def chance_of(
         Largest distance of the tip from the target for a hit [m].
     population : mapping, optional
         Distribution of each variable, as in a study file; the others have their defaults. By
-        default `POPULATION`.
+        default `POPULATION`, with ``layer_1`` and so on of the layers of the plan.
     correlations : sequence, optional
         Correlations, as in a study file.
     limits : SteeringLimits, optional
@@ -235,7 +235,7 @@ def chance_of(
             'prior': asdict(prior or SteeringPrior()),
         }
         document = {'scenario': _SCENARIO, 'seed': seed, 'settings': settings}
-        given = dict(POPULATION if population is None else population)
+        given = dict(_population(plan) if population is None else population)
         studies = _studies(document, insertions, given, list(correlations))
         values, by_entry, by_cause = _simulated(studies, Path(folder), count, progress)
         kept = _shafts(studies[0], shafts)
@@ -254,6 +254,16 @@ def chance_of(
         values=values,
         shafts=kept,
     )
+
+
+def _population(plan: Plan) -> Mapping[str, Any]:
+    """Return the default population, with the spread of the layers of a plan."""
+    layers = {
+        f'layer_{k + 1}': {'lognormal': [1.0, spread], 'within': [0.01, 100.0]}
+        for k, spread in enumerate(plan.layers[:, 2].tolist())
+        if spread > 0.0
+    }
+    return {**POPULATION, **layers}
 
 
 def _studies(

@@ -43,7 +43,9 @@ class _Entry(CheckedSettings):
     name: str = text('', 'name, in place of the label')
     margin: float = constant(0.0, 'm', 'distance that the needle keeps')
     stiffness: float = positive(1.0, 'N/m^2', 'median stiffness')
-    spread: float = constant(0.0, '1', 'standard deviation of the logarithm of the stiffness')
+    spread: float = constant(
+        0.0, '1', 'standard deviation of the logarithm of the stiffness', high=2.0
+    )
     source: str = text('', 'source of the stiffness')
 
 

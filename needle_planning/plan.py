@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.display import Displayed
+from needle_planning.layers import MOST_LAYERS
 from needle_planning.paths import guide_axes
 from needle_ros.errors import ParameterError
 from needle_ros.files import read_document, write_whole
@@ -46,6 +47,9 @@ class Plan(Displayed):
     resolution: float  #: resolution of the search [m]
     straight_bound: float  #: no straight needle has a larger clearance [m]
     bound: float  #: no needle within the limits of the guide has a larger clearance [m]
+    #: Depth at which each layer of tissue begins [m], median stiffness [N/m^2], and standard
+    #: deviation of its logarithm, shape (layers, 3); without rows, the tissue of the needle file.
+    layers: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def length(self) -> float:
@@ -128,7 +132,9 @@ def read_plan(path: Path | str) -> Plan:
     values: dict[str, Any] = {}
     for item in fields(Plan):
         value = document.get(item.name)
-        if item.name in shapes:
+        if item.name == 'layers':
+            value = _layers(f'{path}: layers', value)
+        elif item.name in shapes:
             value = _array(f'{path}: {item.name}', value, shapes[item.name])
         elif item.name in ('needle', 'structure'):
             if not isinstance(value, str):
@@ -141,6 +147,21 @@ def read_plan(path: Path | str) -> Plan:
 
 def _length_of(value: object) -> int:
     return len(value) if isinstance(value, list) else 0
+
+
+def _layers(name: str, value: object) -> FloatArray:
+    if not value:
+        return np.zeros((0, 3))
+    found = _array(name, value, (_length_of(value), 3))
+    starts, stiffnesses, spreads = found.T
+    if starts[0] != 0.0 or (np.diff(starts) <= 0.0).any():
+        raise ParameterError(f'{name} must begin at 0 m and at increasing depths')
+    if len(found) > MOST_LAYERS or (stiffnesses <= 0.0).any() or (spreads < 0.0).any():
+        raise ParameterError(
+            f'{name} must be at most {MOST_LAYERS}, each with a stiffness > 0 N/m^2 and a spread '
+            '>= 0'
+        )
+    return found
 
 
 def _array(name: str, value: object, shape: tuple[int, ...]) -> FloatArray:

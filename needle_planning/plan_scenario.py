@@ -36,10 +36,11 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import find_needle
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import SteeredNeedle
-from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
+from needle_dynamics.steering.parameters import SteeringParameters, with_layers, with_lengths
 from needle_planning.anatomy import Anatomy, Structure
 from needle_planning.certificate import least_clearances, sag_of
 from needle_planning.clearance import Clearance
+from needle_planning.layers import in_layers, MOST_LAYERS
 from needle_planning.paths import inserted_shape, Line
 from needle_planning.plan import Plan, read_plan, write_plan
 from needle_ros.errors import ParameterError
@@ -58,6 +59,9 @@ _TIGHT: Final = 5e-5  #: Largest difference between the bound and the true clear
 _BEYOND: Final = 0.02  #: Distance from the line within which the clearance is exact [m].
 _LEFT: Final = 0.25  #: Least part of the limits of the guide that is left to the law.
 _PARTS: Final = ('folder', 'radius', 'law', 'prior')
+
+#: Variables of the layers of a plan.
+LAYERS: Final = tuple(f'layer_{k + 1}' for k in range(MOST_LAYERS))
 
 METRICS: Final[Mapping[str, Metric]] = {
     'success': Metric('', 'the tip ends within the radius, and the clearance is positive'),
@@ -141,6 +145,9 @@ class PlanScenario(Scenario):
             'skin': Variable(
                 1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3
             ),
+            **dict.fromkeys(
+                LAYERS, Variable(1.0, '1', 'stiffness of a layer over its median', 0.01, 100.0)
+            ),
             'bevel_x': Variable(0.0, 'N', bevel, -1e3, 1e3),
             'bevel_z': Variable(0.0, 'N', bevel, -1e3, 1e3),
             'path_noise': Variable(
@@ -183,7 +190,10 @@ class PlanScenario(Scenario):
     def _inputs(self) -> _Inputs:
         """Files of the folder, which only insertions need."""
         plan, limits = read_plan(self._folder / _PLAN), self._limits
-        needle, steering, _ = find_needle(plan.needle)
+        preset = find_needle(plan.needle)
+        needle, steering, prior = in_layers(
+            plan.layers, preset.needle, preset.steering, self._prior
+        )
         clearance = Clearance(
             _read_anatomies(self._folder),
             np.vstack([plan.entry, plan.path]),
@@ -201,7 +211,7 @@ class PlanScenario(Scenario):
         )
         # Of deviations from the plan, which contains the nominal bevel.
         plain = replace(steering, bevel_load=(0.0,))
-        model = SteeringModel(needle, plain, plan.depths, self._prior)
+        model = SteeringModel(needle, plain, plan.depths, prior)
         tips = (plan.path - plan.entry) @ plan.axes[[0, 2]].T
         line = Line(plan.entry, plan.axes)
         return _Inputs(plan, tips, line, needle, steering, clearance, model, limits)
@@ -259,6 +269,8 @@ class PlanScenario(Scenario):
         lengths = row['bending_length'], row['skin']
         inputs = self._inputs
         needle, steering = with_lengths(inputs.needle, inputs.steering, *lengths)
+        if count := len(inputs.plan.layers):
+            needle = with_layers(needle, [row[name] for name in LAYERS[:count]])
         roll, loads = inputs.plan.roll, inputs.steering.bevel_load
         nominal = max(loads)
         x = nominal * sin(roll) + row['bevel_x']

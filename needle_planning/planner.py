@@ -4,15 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import inf
+from math import inf, isfinite
 from typing import Final, TypeAlias
 
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle, NeedlePreset
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.steering.parameters import SteeringParameters
 from needle_planning.anatomy import Anatomy
 from needle_planning.certificate import simulate_insertion, SimulatedInsertion
 from needle_planning.clearance import Clearance, image_frame
+from needle_planning.layers import in_layers, tissue_layers
 from needle_planning.paths import (
     best_bow,
     bow_profile,
@@ -162,7 +165,7 @@ class _Planner:
         skin_limit: float,
         resolution: float,
     ) -> None:
-        self.target = _point('target', target)
+        self.anatomies, self.target = anatomies, _point('target', target)
         if not is_number(resolution) or not resolution >= _FINEST:
             raise ParameterError(f'resolution must be >= {_FINEST:g} m, got {resolution!r}')
         if not (is_number(skin_limit) or skin_limit == inf) or skin_limit < 0.0:
@@ -215,7 +218,8 @@ class _Planner:
         elif bows:
             profile = self._profile(progress)
             curved = self._search(progress, profile)
-            bound = max(curved.bound, bound)
+            # A needle in layers may bow more than the one of the profile.
+            bound = self.at_target if self._layered else max(curved.bound, bound)
             best = self._bowed(best, self._candidates(lines, curved), profile, progress)
         if best is None:
             raise self._no_path(lines, bound, bows)
@@ -238,7 +242,20 @@ class _Planner:
             resolution=self.resolution,
             straight_bound=lines.bound,
             bound=bound,
+            layers=self._layers(line),
         )
+
+    @property
+    def _layered(self) -> bool:
+        every = (one for anatomy in self.anatomies for one in anatomy.structures.values())
+        return any(isfinite(one.stiffness) for one in every)
+
+    def _layers(self, line: Line) -> FloatArray:
+        return tissue_layers(self.anatomies, line.entry, self.target, self.preset.needle)
+
+    def _needle(self, line: Line) -> tuple[NeedleParameters, SteeringParameters]:
+        """Return the needle in the layers of tissue along a line."""
+        return in_layers(self._layers(line), self.preset.needle, self.preset.steering)[:2]
 
     def _search(self, progress: Callable[[str], object], bow: FloatArray | None = None) -> Lines:
         kind = 'straight: ' if bow is None else 'with a bow: '
@@ -256,7 +273,7 @@ class _Planner:
         return Line(entry, guide_axes(self.target - entry))
 
     def _insert(self, line: Line, guide: FloatArray) -> tuple[FloatArray, SimulatedInsertion]:
-        needle, steering, _ = self.preset
+        needle, steering = self._needle(line)
         length = float(np.linalg.norm(self.target - line.entry))
         depths = np.linspace(0.0, length, len(guide) + 1)
         return depths, simulate_insertion(
@@ -306,7 +323,6 @@ class _Planner:
         progress: Callable[[str], object],
     ) -> _Best | None:
         """Return the best plan with a bow, if it gains more than the resolution."""
-        needle, steering, _ = self.preset
         chosen, least = best, 0.0 if best is None else best[3].clearance + self.resolution
         for k, entry in enumerate(entries, 1):
             progress(f'best bow of line {k} of {len(entries)}')
@@ -315,6 +331,7 @@ class _Planner:
                 continue
             line = self._line(entry)
             length = float(np.linalg.norm(self.target - entry))
+            needle, steering = self._needle(line)
             responses = path_responses(needle, steering, length, self.limits.step_length)
             bow = best_bow(
                 self.clearance, line, responses, self.limits, self.roll, self.skin_limit
