@@ -73,7 +73,7 @@ class Constants(NamedTuple):
 class LaneModes(NamedTuple):
     """Modes of a needle of length 1, for the lanes."""
 
-    count: int  #: number of modes; two for a needle with one, of which the second has no effect
+    number: int  #: number of modes; two for a needle with one, of which the second has no effect
     #: Two modes: the first columns of `ModeTables.series`, shape (1 + 4 m, `COLUMNS`). More:
     #: polynomials of `many_lanes`, shape (pieces terms, columns) with the columns G / xi^5 and
     #: H / xi of each pair, phi / xi^2 and phi'' of each mode.

@@ -274,7 +274,7 @@ def _end(w: FloatArray, n: int) -> None:
 
 @compiled
 def empty_lanes(modes: LaneModes) -> FloatArray:
-    return np.zeros((MANY_ROWS if modes.count > 2 else ROWS) * LANES)
+    return np.zeros((MANY_ROWS if modes.number > 2 else ROWS) * LANES)
 
 
 @inlined
@@ -292,8 +292,8 @@ def step_lanes(
     rotate(w, n, modes)
     _move(w, n)
     _end(w, n)
-    if modes.count > 2:
-        end_many_lanes(w, n, modes.count)
+    if modes.number > 2:
+        end_many_lanes(w, n, modes.number)
 
 
 @compiled
@@ -303,8 +303,8 @@ def tip_lanes(w: FloatArray, n: int, modes: LaneModes) -> None:
         xi = w[DEPTH + i] / w[LENGTH + i]
         square = xi * xi
         w[XI + i], w[XI4 + i] = xi, square * square
-    if modes.count > 2:
-        tip_many_lanes(w, n, modes.count, modes.table)
+    if modes.number > 2:
+        tip_many_lanes(w, n, modes.number, modes.table)
         return
     _modes(w, n, modes.table, *_TIP_COLUMNS)
     for i in range(n):
@@ -341,7 +341,7 @@ def load_lane(
         w[row + i] = 0.0
     for k in range(m - 2):
         w[Q1 + k * LANES + i] = state[2 + k]
-    if modes.count > 2:
+    if modes.number > 2:
         load_many_lane(w, i, modes.table, state[m + 2 :])
         return
     g11, g12, g22 = _gram(modes.table, depth / length)
@@ -362,7 +362,7 @@ def save_lane(w: FloatArray, i: int, modes: LaneModes, state: FloatArray) -> Non
     state[0], state[m] = length - w[DEPTH + i], -w[VELOCITY + i]
     for k in range(m - 2):
         state[2 + k] = w[Q1 + k * LANES + i]
-    if modes.count > 2:
+    if modes.number > 2:
         save_many_lane(w, i, modes.table, state[m + 2 :])
         return
     g11, g12, g22 = _gram(modes.table, w[DEPTH + i] / length)

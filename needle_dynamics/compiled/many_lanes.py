@@ -389,7 +389,7 @@ def _start(n: int, r: FloatArray, m: int) -> None:
 @compiled
 def rotate_many_lanes(w: FloatArray, n: int, modes: LaneModes) -> None:
     """Advance the deflections through the step of each lane."""
-    r, m, table = w.reshape(-1, LANES), modes.count, modes.table
+    r, m, table = w.reshape(-1, LANES), modes.number, modes.table
     for i in range(n):
         _evaluate(r, i, table, w[XI + i])
     _factor(n, r, m)

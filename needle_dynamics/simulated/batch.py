@@ -238,7 +238,7 @@ def _take(
             progress()
 
     def together(needles: FloatArray, modes: LaneModes, some: IntArray) -> None:
-        advance = run_many if modes.count > 2 else lanes.run
+        advance = run_many if modes.number > 2 else lanes.run
         advance(needles, modes, layers, inputs, some, wide, wide_kept, completed)
         for _ in some:
             progress()

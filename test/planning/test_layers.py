@@ -75,8 +75,8 @@ def test_at_most_eight_layers_with_the_same_mean(labels: list[int]) -> None:
             for k in (1, 2, 3)
         },
     )
-    ends = np.array([[0.0, 0.0, -0.5e-3], [0.0, 0.0, 79.5e-3]])
-    found = tissue_layers([anatomy], *ends, NEEDLE)
+    entry, target = np.array([0.0, 0.0, -0.5e-3]), np.array([0.0, 0.0, 79.5e-3])
+    found = tissue_layers([anatomy], entry, target, NEEDLE)
     if not any(labels):
         assert len(found) == 0
         return

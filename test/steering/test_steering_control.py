@@ -217,7 +217,7 @@ def test_forecasts_hold_in_layers_that_differ_independently() -> None:
         rng = np.random.default_rng(seed)
         truth = replace(
             sample_truth(needle, STEERING, true, rng, seed),
-            needle=with_layers(needle, np.exp(0.3 * rng.standard_normal(4))),
+            needle=with_layers(needle, np.exp(0.3 * rng.standard_normal(4)).tolist()),
         )
         positions = rng.uniform(-5e-3, 5e-3, (4, 2))
         for one, model in models.items():
