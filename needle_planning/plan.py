@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Final
 
+from needle_controller.steering.planned_path import PlannedPath
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.display import Displayed
 from needle_planning.layers import MOST_LAYERS
@@ -60,6 +61,12 @@ class Plan(Displayed):
     def axes(self) -> FloatArray:
         """Axes x, y (direction) and z of the guide in patient coordinates, rows, shape (3, 3)."""
         return guide_axes(self.direction)
+
+    @property
+    def tip_path(self) -> PlannedPath:
+        """Path of the tip in the frame of the guide, for a steering law."""
+        tips = (self.path - self.entry) @ self.axes[[0, 2]].T
+        return PlannedPath(depths=self.depths, tips=tips, guide=self.guide)
 
     def columns(self) -> dict[str, FloatArray]:
         guide = np.vstack([self.guide, self.guide[-1:]])

@@ -4,8 +4,7 @@ Scenario of a study: insert sampled needles along a plan, in a patient that diff
 
 The sensor reports the tip in the frame of the plan: its origin is the planned entry point, its
 axes are those of the guide. The true guide deviates from this frame by the error of the entry
-pose, and the true anatomy by the error of the registration. The law receives the deviation of the
-tip from the planned path, and adds its setpoint to that of the plan: the needle is linear in both.
+pose, and the true anatomy by the error of the registration. The law follows the planned path.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
-from math import ceil, cos, hypot, inf, pi, sin
+from math import ceil, cos, hypot, pi, sin
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -24,6 +23,7 @@ from needle_controller.steering.law import (
     GuideSetpoint,
     SteeringFaultError,
 )
+from needle_controller.steering.planned_path import PlannedPath
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.settings import SteeringLimits, SteeringPrior
 from needle_controller.steering.simulation import (
@@ -57,7 +57,6 @@ _SEEDS: Final = 2**63  #: Upper bound of the seeds of paths.
 _SPACING: Final = 5e-3
 _TIGHT: Final = 5e-5  #: Largest difference between the bound and the true clearance [m].
 _BEYOND: Final = 0.02  #: Distance from the line within which the clearance is exact [m].
-_LEFT: Final = 0.25  #: Least part of the limits of the guide that is left to the law.
 _PARTS: Final = ('folder', 'radius', 'law', 'prior')
 
 #: Variables of the layers of a plan.
@@ -109,13 +108,12 @@ class _Inputs(NamedTuple):
     """Content of the folder of a scenario."""
 
     plan: Plan
-    tips: FloatArray  #: planned tip at each depth in x and z [m], shape (n + 1, 2)
+    path: PlannedPath
     line: Line
     needle: NeedleParameters
     steering: SteeringParameters
     clearance: Clearance
-    model: SteeringModel  #: nominal model of deviations from the plan
-    limits: SteeringLimits  #: limits of the law
+    model: SteeringModel  #: nominal model
 
 
 class PlanScenario(Scenario):
@@ -189,7 +187,7 @@ class PlanScenario(Scenario):
     @cached_property
     def _inputs(self) -> _Inputs:
         """Files of the folder, which only insertions need."""
-        plan, limits = read_plan(self._folder / _PLAN), self._limits
+        plan = read_plan(self._folder / _PLAN)
         preset = find_needle(plan.needle)
         needle, steering, prior = in_layers(
             plan.layers, preset.needle, preset.steering, self._prior
@@ -198,23 +196,11 @@ class PlanScenario(Scenario):
             _read_anatomies(self._folder),
             np.vstack([plan.entry, plan.path]),
             radius=plan.radius,
-            beyond=_BEYOND + limits.guide_limit,
+            beyond=_BEYOND + self._limits.guide_limit,
         )
-        # The law may use what the plan leaves of the limits.
-        travel = np.abs(np.diff(plan.guide, axis=0, prepend=0.0)).max()
-        limit, step = limits.guide_limit, limits.guide_step
-        limits = replace(
-            limits,
-            guide_limit=max(limit - float(np.abs(plan.guide).max()), _LEFT * limit),
-            guide_step=inf if step == inf else max(step - float(travel), _LEFT * step),
-            turns=0,
-        )
-        # Of deviations from the plan, which contains the nominal bevel.
-        plain = replace(steering, bevel_load=(0.0,))
-        model = SteeringModel(needle, plain, plan.depths, prior)
-        tips = (plan.path - plan.entry) @ plan.axes[[0, 2]].T
+        model = SteeringModel(needle, steering, plan.depths, prior)
         line = Line(plan.entry, plan.axes)
-        return _Inputs(plan, tips, line, needle, steering, clearance, model, limits)
+        return _Inputs(plan, plan.tip_path, line, needle, steering, clearance, model)
 
     def insert(self, rows: Sequence[Row], streams: Streams) -> Iterator[dict[str, float]]:
         for row, rng in zip(rows, streams, strict=True):
@@ -239,15 +225,11 @@ class PlanScenario(Scenario):
             dropout=row['lost'], **{name: row[name] for name in SENSOR_ERRORS}
         )
         sensor = SteppedTipSensor(plant, row['tip_noise'], errors, seed, rng, rng)
-
-        def deviation(tip: FloatArray) -> FloatArray | None:
-            measured = sensor(tip)
-            return None if measured is None else measured - inputs.tips[plant.step]
-
-        law = build_law(self._law, inputs.model, (0.0, 0.0), inputs.limits)
+        limits, path = replace(self._limits, turns=0), inputs.path
+        law = build_law(self._law, inputs.model, path.tips[-1], limits, inputs.plan.roll, path)
         stopped = False
         try:
-            simulate_steering(law, plant, deviation)
+            simulate_steering(law, plant, sensor)
         except SteeringFaultError:
             stopped = True
         shafts = self._in_image(row, np.stack(plant.shafts))
@@ -294,7 +276,7 @@ class PlanScenario(Scenario):
             seed=seed,
         )
         frame = row['frame_x'], row['frame_z']
-        return _PlannedPlant(one, inputs.plan, inputs.line, self._limits, frame, origin)
+        return _PlannedPlant(one, inputs.plan, inputs.line, frame, origin)
 
     def _in_image(self, row: Row, points: FloatArray) -> FloatArray:
         """Return points of the frame of the plan in the image: without errors the same ones."""
@@ -312,19 +294,18 @@ class PlanScenario(Scenario):
 
 
 class _PlannedPlant(SteeringPlant):
-    """Plant whose guide follows a plan and a law; it keeps the shapes of the shaft."""
+    """Plant that keeps the shapes of the shaft."""
 
     def __init__(
         self,
         needle: SteeredNeedle,
         plan: Plan,
         line: Line,
-        limits: SteeringLimits,
         frame: tuple[float, float],
         origin: tuple[float, float],
     ) -> None:
         super().__init__(needle, plan.depths, frame, origin)
-        self._plan, self._line, self._limits = plan, line, limits
+        self._line = line
         self._error = np.array(origin), np.array(frame)
         self._along = np.linspace(0.0, plan.length, ceil(plan.length / _SPACING) + 1)
         self.shafts: list[FloatArray] = []  #: points of the shaft, shape (k, 3) [m] each
@@ -342,10 +323,8 @@ class _PlannedPlant(SteeringPlant):
         self.shafts.append(self._line.points(points, deflections))
 
     def guide(self, to: GuideSetpoint) -> None:
-        now, most, change = self.needle.guide, self._limits.guide_limit, self._limits.guide_step
-        wanted = self._plan.guide[self.step] + to[:2]
-        x, z = np.clip(np.clip(wanted, now - change, now + change), -most, most).tolist()
-        super().guide(GuideSetpoint(x, z, to.roll))
+        # The needle is not turned; its own bevel may have another direction.
+        super().guide(to._replace(roll=0.0))
         self._keep()
 
     def insert(self) -> None:

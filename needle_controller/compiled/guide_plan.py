@@ -10,6 +10,7 @@ from needle_controller.compiled.hypotheses import (
     BEVEL,
     constant_mean,
     constants,
+    guide_ahead,
     HARD,
     layered_shift,
     LONG,
@@ -48,6 +49,9 @@ _WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
 #: Cost of the distance from the setpoint that follows the line to the target, and of its motion
 #: [shift of the tip per shift of the guide, squared].
 _DEVIATION, _MOTION = 1e-3, 2.5e-3
+
+#: Weight of the expected squared deviation from a planned path, relative to the squared miss.
+PATH: Final = 10.0
 
 #: Depths over which the tip is brought to the line, variance of the response of a hypothesis
 #: relative to its square, and least weight of a hypothesis in the plan.
@@ -212,12 +216,13 @@ def _best(
 ) -> tuple[float, complex]:
     """Return mean square distance from the reachable set and position of the best candidate."""
     costs, whole, found = _costs(c, w, ends, candidates), 0.0, np.empty(2)
-    follow = _follow(c, w) if c.limit > 0.0 else 0j
+    follow, gain = _follow(c, w) if c.limit > 0.0 else (0j, 0.0)
+    deviation = _DEVIATION + c.following * gain
     for plane in range(2):
         wanted = follow.imag if plane else follow.real
         wanted, best = min(max(wanted, -c.limit), c.limit), inf
         for t in range(candidates.shape[1]):
-            cost = costs[plane, t] + _DEVIATION * (candidates[plane, t] - wanted) ** 2
+            cost = costs[plane, t] + deviation * (candidates[plane, t] - wanted) ** 2
             if cost < best:
                 best, at = cost, t
         whole += costs[plane, at]
@@ -289,14 +294,14 @@ def _guide_load(c: Steering, w: FloatArray) -> tuple[complex, float]:
 
 
 @compiled
-def _follow(c: Steering, w: FloatArray) -> complex:
-    """Return the setpoint that brings the tip to the line to the target over the next steps."""
-    r, k, last, now = c.responses, c.counts[STEP], len(c.guide), _guide_now(c)
-    guide, need, gain, used = c.guide.copy(), 0j, _MOTION, np.flatnonzero(w > _LEAST_WEIGHT)
-    guide[k:] = now
+def _follow(c: Steering, w: FloatArray) -> tuple[complex, float]:
+    """Return the setpoint that brings the tip to its path over the next steps, and its gain."""
+    r, k, last, guide = c.responses, c.counts[STEP], len(c.guide), guide_ahead(c)
+    need, gain, used = 0j, _MOTION, np.flatnonzero(w > _LEAST_WEIGHT)
+    moved = complex(c.target[0], c.target[1]) - c.waypoints[last]
     for at in range(k + 1, min(k + _AHEAD, last) + 1):
         form = tip_form(c, w, _LEAST_WEIGHT, at, guide)
-        line = c.path[at] * complex(c.target[0], c.target[1])
+        line = c.waypoints[at] + c.path[at] * moved
         for one in used:
             i = int(one)
             g, shift = i % len(r.guide), 0.0
@@ -307,4 +312,4 @@ def _follow(c: Steering, w: FloatArray) -> complex:
                 shift += layered_shift(c, i, at, j)
             need += w[i] * shift * (line - tip_mean(c, i, form))
             gain += w[i] * (1.0 + _DOUBT) * shift**2
-    return now + need / gain
+    return guide[k] + need / gain, gain

@@ -65,8 +65,7 @@ BEVEL, LONG, HARD, LAYERS = range(4)
 #: diaphragm move by 5 to 10 mm.
 _GROSS: Final = 5e-3
 
-#: Prior of the probability of a gross error, a beta distribution: the number of gross errors, and
-#: of all measurements, with the same effect.
+#: Beta prior of the probability of a gross error: numbers of gross errors and of measurements.
 _GROSS_PRIOR, _COUNT_PRIOR = 0.1, 20.0
 
 #: A sensor fault: standard deviation of its offset, and of the change of the offset from one
@@ -104,6 +103,9 @@ class Steering(NamedTuple):
     responses: HypothesisResponses
     prior: StatePrior
     path: Vector  #: depths relative to the target depth, from 0 to 1, shape (n + 1,)
+    waypoints: ComplexVector  #: planned tip at each depth, 0 without a plan [m], shape (n + 1,)
+    planned: ComplexVector  #: planned guide in each step, 0 without a plan [m], shape (n,)
+    following: float  #: weight of the squared deviation from the waypoints
     limit: float  #: largest position of the guide along each axis [m]
     load_limit: float  #: largest planned force of the guide [N]
     ranges: Vector  #: range of the guide motion after a number of steps, from 1 [m], shape (n,)
@@ -181,11 +183,11 @@ def constants(c: Steering) -> int:
 
 
 @inlined
-def _guide_at_rest(c: Steering) -> ComplexArray:
+def guide_ahead(c: Steering) -> ComplexArray:
+    """Return past positions of the guide [m], and later ones: it moves only by the plan."""
     guide, done = c.guide.copy(), min(c.counts[STEP], len(c.guide))
-    if done > 0:
-        for j in range(done, len(guide)):
-            guide[j] = guide[done - 1]
+    off = guide[done - 1] - c.planned[done - 1] if done > 0 else 0j
+    guide[done:] = c.planned[done:] + off
     return guide
 
 
@@ -348,9 +350,9 @@ def _moments(w: FloatArray, tip: TipDistribution) -> TipMoments:
 
 @kernel
 def predict(boxed: Boxed[Steering], at: int) -> TipMoments:
-    """Predict the tip at depth number ``at`` with guide and roll as last commanded."""
+    """Predict the tip at a depth number with the last roll, and the guide of `guide_ahead`."""
     c, w = boxed.value, weights(boxed.value.logs)
-    return _moments(w, tip_distribution(c, tip_form(c, w, 0.0, at, _guide_at_rest(c))))
+    return _moments(w, tip_distribution(c, tip_form(c, w, 0.0, at, guide_ahead(c))))
 
 
 @kernel
@@ -364,7 +366,7 @@ def update(
     `VALID` or the reason for a stop, and the innovation along both axes [m].
     """
     c, w = boxed.value, weights(boxed.value.logs)
-    tip = _measurement_distribution(c, tip_form(c, w, 0.0, at, _guide_at_rest(c), 1.0), variance)
+    tip = _measurement_distribution(c, tip_form(c, w, 0.0, at, guide_ahead(c), 1.0), variance)
     predicted = _moments(w, tip)
     kind, used = _check_sensor(c, x, z)
     off = complex(x - predicted.x, z - predicted.z)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import inf, isfinite, nan
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
+from needle_controller.steering.planned_path import PlannedPath
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import FloatArray
@@ -120,7 +121,12 @@ def find_law(name: str) -> LawClass:
 
 
 def build_law(
-    name: str, model: SteeringModel, target: ArrayLike, limits: SteeringLimits, roll: float = 0.0
+    name: str,
+    model: SteeringModel,
+    target: ArrayLike,
+    limits: SteeringLimits,
+    roll: float = 0.0,
+    path: PlannedPath | None = None,
 ) -> SteeringLaw:
     """
     Construct a steering law by name.
@@ -137,6 +143,8 @@ def build_law(
         Limits of the guide setpoints.
     roll : float
         Roll of the needle at the start [rad].
+    path : PlannedPath, optional
+        Path to follow, with the depths of the model; the law must have a method ``follow(path)``.
 
     Raises
     ------
@@ -155,6 +163,10 @@ def build_law(
     missing = [name for name in members if not hasattr(law, name)]
     if missing:
         raise ParameterError(f'law {name!r} has no {", ".join(missing)}')
+    if path is not None:
+        if not hasattr(law, 'follow'):
+            raise ParameterError(f'law {name!r} cannot follow a planned path')
+        law.follow(path)
     return law
 
 

@@ -27,6 +27,11 @@ turned only if that reduces the distance below the best distance by the guide al
 turn is left, the later load of the bevel may have any direction. A hypothesis with windup has its
 own roll of the tip, :math:`\max(\phi - d, \min(\phi + d, \varphi))` after a roll of the base
 to :math:`\phi`, with the previous roll of the tip :math:`\varphi` and the lag :math:`d`.
+
+**Planned path.** After `MultiHypothesisLaw.follow`, :math:`l` is the planned path instead of the
+line, :math:`b_0` moves by the plan, and the expected squared deviation from the path over the next
+four depths is added to the mean squared distance of the target from the reachable set, with the
+weight `guide_plan.PATH`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,10 +48,11 @@ from needle_controller.steering.law import (
     SteeringLaw,
     TipEstimate,
 )
+from needle_controller.steering.planned_path import PlannedPath
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import ComplexArray, FloatArray
-from needle_ros.errors import JobError, ParameterError
+from needle_ros.errors import JobError, ParameterError, ShapeError
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -129,6 +135,9 @@ class MultiHypothesisLaw(SteeringLaw):
             responses=model.responses,
             prior=model.state_prior,
             path=(model.depths - model.depths[0]) / np.ptp(model.depths),
+            waypoints=np.zeros(model.steps + 1, dtype=np.complex128),
+            planned=np.zeros(model.steps, dtype=np.complex128),
+            following=0.0,
             limit=float(limit),
             load_limit=float(limits.load_limit),
             ranges=np.minimum(limits.guide_step * np.arange(1.0, model.steps + 1.0), 2.0 * limit),
@@ -154,6 +163,22 @@ class MultiHypothesisLaw(SteeringLaw):
             error = OutOfReachError(self._reachable('out of reach'), self.reach)
             self._now.target[:], self._hit_probability = before, None
             raise error
+
+    def follow(self, path: PlannedPath) -> None:
+        """Follow a planned path with the depths of the model, before the first measurement."""
+        now, tips = self._now, self._model.steps + 1
+        waypoints, planned = (
+            np.array(one @ (1.0, 1.0j), dtype=np.complex128) for one in (path.tips, path.guide)
+        )
+        if (len(waypoints), len(planned)) != (tips, tips - 1):
+            raise ShapeError(f'a path must have the {tips - 1} steps of the model')
+        # In every hypothesis the planned guide leads along the path, until a measurement deviates.
+        r, point = self._model.responses, np.arange(len(now.mean)) % len(now.turned)
+        bevel = np.einsum('gkj,gj->gk', r.bevel, now.turned)[point]
+        load = now.mean[:, tips + hypotheses.BEVEL, np.newaxis]
+        now.mean[:, :tips] = waypoints - (r.guide @ planned)[point] - load * bevel
+        self._use(now._replace(waypoints=waypoints, planned=planned, following=guide_plan.PATH))
+        self._hit_probability = None
 
     # Estimates.
 
