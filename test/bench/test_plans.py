@@ -76,7 +76,7 @@ def test_arc_between_two_points_has_its_curvature(curvature: float) -> None:
     arc = bowed_arc(entry, target, curvature * np.array([0.6, -0.8]))
     assert arc.curvature == pytest.approx(curvature, abs=1e-9)
     assert arc.end == pytest.approx(target, abs=1e-8)
-    angle = np.arccos(min(1.0, arc.tangent @ arc.axes_at_end()[0]))
+    angle = np.arccos(min(1.0, float(arc.tangent @ arc.axes_at_end()[0])))
     assert angle == pytest.approx(curvature * arc.length, abs=1e-6)
     again = arc.reverse().reverse()
     assert again.start == pytest.approx(entry, abs=1e-8)
