@@ -10,10 +10,11 @@ from itertools import product
 from math import asin, cos, hypot, sin
 from typing import Final, NamedTuple
 
+from needle_controller.steering.insertion_plan import guide_axes
 from needle_dynamics import find_needle, FloatArray, SteeredNeedle
 from needle_dynamics.needles import NeedlePreset
 from needle_planning.clearance import Clearance
-from needle_planning.paths import guide_axes, inserted_shape, Line
+from needle_planning.paths import inserted_shape, Line
 from needle_planning.search import EntryRegion
 import numpy as np
 

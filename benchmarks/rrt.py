@@ -19,9 +19,9 @@ from time import process_time
 from typing import Any, Final
 
 from benchmarks.arcs import Arc, arc_clearance, biarc, bowed_arc
+from needle_controller.steering.insertion_plan import guide_axes
 from needle_dynamics import FloatArray
 from needle_planning.clearance import Clearance
-from needle_planning.paths import guide_axes
 from needle_planning.search import EntryRegion
 import numpy as np
 from ompl import base, geometric, util

@@ -10,6 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.steering.executive import SteeringExecutive
+from needle_controller.steering.insertion_plan import read_plan
 from needle_controller.steering.insertion_record import RecordFile, SteeringRecord
 from needle_controller.steering.law import DEFAULT_LAW, find_law, STEERING_LAWS, TipEstimate
 from needle_controller.steering.motion import JointMotion
@@ -44,6 +45,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 _WATCH = 0.05  #: Time between two checks for missing inputs, and for a plan that is computed [s].
 _ACTION = 'trajectory_action'  #: Parameter with the action of a robot.
 _ARRIVAL = Duration(seconds=1.0)  #: Longest time until a motion is acknowledged, in lock-step.
+_PLAN = 'plan'  #: Parameter with the file of a plan.
 _SELDOM = 10.0  #: Shortest time between two warnings of a record that cannot be written [s].
 
 
@@ -70,6 +72,9 @@ class SteeringNode(CompiledNode):
     after a restart of the node, the target resumes the insertion if needle, guide and tip are
     where the record leaves them.
 
+    With ``plan``, a file of ``needle plan``, an insertion has the steps of the plan, and its tip
+    follows the path; a target must have the depth of the plan.
+
     The node passes messages to an `SteeringExecutive`, which decides, and publishes its motions.
     """
 
@@ -95,6 +100,7 @@ class SteeringNode(CompiledNode):
             'action follow_joint_trajectory of a robot that moves needle and guide, such as '
             '/arm/follow_joint_trajectory; empty: the topic joint_trajectory',
         )
+        self.declare_text(_PLAN, '', 'file of `needle plan -o` to insert along; empty: no plan')
         needle = declare_needle(self, DEFAULT_NEEDLE)
         for prefix, names in (('model.', OF_NEEDLE), ('steering.', OF_STEERING)):
             self.declare_settings(prefix, defaults_of(prefix, needle), names)
@@ -132,7 +138,12 @@ class SteeringNode(CompiledNode):
         settings = self.settings('', ExecutiveSettings)
         law = self.text('law')
         find_law(law)
-        self._loop = SteeringExecutive(needle, steering, prior, settings, start=ThreadJob, law=law)
+        plan = read_plan(file) if (file := self.text(_PLAN)) else None
+        if plan is not None and plan.needle != name:
+            raise ParameterError(f'{file} is a plan for the needle {plan.needle}, got {name}')
+        self._loop = SteeringExecutive(
+            needle, steering, prior, settings, start=ThreadJob, law=law, plan=plan
+        )
         self._loop.authority = self._authority
         self._measurers = Publishers(self, contract.MEASURER, self._watch)
         if action := self.text(_ACTION):

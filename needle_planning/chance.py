@@ -12,12 +12,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeAlias
 
+from needle_controller.steering.insertion_plan import Plan
 from needle_controller.steering.law import DEFAULT_LAW
 from needle_controller.steering.settings import SteeringLimits, SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.display import Displayed
 from needle_planning.anatomy import Anatomy
-from needle_planning.plan import Plan
 from needle_ros.errors import missing_extra, ParameterError
 from needle_ros.files import DocumentError, read_document
 from needle_ros.process_pool import processes

@@ -9,6 +9,7 @@ from itertools import groupby
 from math import ceil, isfinite
 from typing import Any, Final, NamedTuple
 
+from needle_controller.steering.insertion_plan import MOST_LAYERS
 from needle_controller.steering.settings import SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
@@ -17,7 +18,6 @@ from needle_planning.anatomy import Anatomy
 from needle_planning.clearance import image_frame
 import numpy as np
 
-MOST_LAYERS: Final = 8  #: Most layers of tissue along a line.
 _SPACING: Final = 1e-4  #: Spacing of the points of a line whose labels are read [m].
 _LEAST: Final = 1e-3  #: Least stiffness [N/m^2]: its logarithm is finite.
 _WIDEST: Final = 2.0  #: Largest spread of a prior.

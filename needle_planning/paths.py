@@ -50,20 +50,6 @@ def needle_radius(needle: NeedleParameters) -> float:
     return sqrt(2.0 * needle.area_moment / needle.area + needle.area / (2.0 * pi))
 
 
-def guide_axes(direction: FloatArray) -> FloatArray:
-    """
-    Return the axes x, y, z of the guide in patient coordinates, rows, shape (3, 3).
-
-    y is the direction of the insertion, z points up (S) as far as possible, or to the front (A)
-    for an insertion along the body axis.
-    """
-    y = direction / np.linalg.norm(direction)
-    up = np.array([0.0, 0.0, 1.0]) if abs(y[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
-    z = up - (up @ y) * y
-    z /= np.linalg.norm(z)
-    return np.stack([np.cross(y, z), y, z])
-
-
 class Line(NamedTuple):
     """Line of an insertion."""
 

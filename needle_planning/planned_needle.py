@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
+from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import find_needle
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_planning.paths import inserted_shape, Line
-from needle_planning.plan import Plan
 from needle_ros.errors import ParameterError
 import numpy as np
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from math import inf, isfinite
 from typing import Final, TypeAlias
 
+from needle_controller.steering.insertion_plan import guide_axes, Plan
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle, NeedlePreset
@@ -19,7 +20,6 @@ from needle_planning.layers import in_layers, tissue_layers
 from needle_planning.paths import (
     best_bow,
     bow_profile,
-    guide_axes,
     Line,
     needle_radius,
     path_responses,
@@ -27,7 +27,6 @@ from needle_planning.paths import (
     STEEPEST,
     step_depths,
 )
-from needle_planning.plan import Plan
 from needle_planning.search import disc_region, EntryRegion, Lines, search_lines, voxel_region
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.settings import is_number

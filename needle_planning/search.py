@@ -22,11 +22,11 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Final, NamedTuple
 
+from needle_controller.steering.insertion_plan import guide_axes
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_dynamics.simulated.batch import thread_count
 from needle_planning.anatomy import Anatomy
 from needle_planning.clearance import Clearance, image_frame, ImageFrame, LineClearance, NO_BOW
-from needle_planning.paths import guide_axes
 from needle_ros.errors import ParameterError
 import numpy as np
 

@@ -17,12 +17,13 @@ from needle_controller.state_machine import StateMachine
 from needle_controller.steering.continuous import ContinuousInsertion
 from needle_controller.steering.guarded_law import GuardedLaw
 from needle_controller.steering.insertion import SteppedInsertion
+from needle_controller.steering.insertion_plan import Plan
 from needle_controller.steering.insertion_record import PlannedInsertion, RecordKeeper
 from needle_controller.steering.insertion_status import describe, summarize
 from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import MotionControl, Retraction
-from needle_controller.steering.planner import describe_target, InsertionPlanner
+from needle_controller.steering.planner import check_plan, describe_target, InsertionPlanner
 from needle_controller.steering.planning import Job, StartJob
 from needle_controller.steering.settings import ExecutiveSettings, SteeringPrior
 from needle_dynamics.arrays import FloatArray
@@ -71,6 +72,13 @@ class SteeringExecutive(StateMachine[JointMotion]):
         Starts the computation of a plan, see `StartJob`.
     law : str
         Steering law, see `build_law`.
+    plan : Plan, optional
+        Plan that all insertions follow.
+
+    Raises
+    ------
+    ParameterError
+        The plan is outside the settings.
     """
 
     def __init__(
@@ -82,6 +90,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         steady: Callable[[], float] = monotonic,
         start: StartJob = Job,
         law: str = DEFAULT_LAW,
+        plan: Plan | None = None,
     ) -> None:
         super().__init__(steady, {TARGET: (INSERTION,)})
         self.settings = settings
@@ -90,7 +99,9 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self._tip_stream = InputMonitor(TIP_DEFLECTION.name, timeout, frames=('', ENTRY))
         self._streams = self._joint_stream, self._tip_stream
         self.fault, self._noise = '', prior.noise
-        self.planner = InsertionPlanner(needle, steering, prior, settings, start, law)
+        if plan is not None:
+            check_plan(plan, settings)
+        self.planner = InsertionPlanner(needle, steering, prior, settings, start, law, plan)
         self._motions = MotionControl(settings, self.events)
         self.keeper = RecordKeeper()  #: record of the insertion, for an executive after a restart
         self._tip: tuple[float, ...] | None = None  #: the newest reading of the tip [m]

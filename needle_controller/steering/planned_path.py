@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from needle_dynamics.arrays import FloatArray
 import numpy as np
+
+_SHORTEST: Final = 1e-3  #: Shortest first step [m].
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -18,8 +21,9 @@ class PlannedPath:
     guide: FloatArray  #: planned position of the guide in each step, shape (n, 2)
 
     def since(self, depth: float) -> PlannedPath:
-        """Return the path from a depth on [m], less than the last one."""
-        first = int(np.searchsorted(self.depths, depth, side='right'))
+        """Return the path from a depth on [m], with a first step of at least 1 mm."""
+        first = int(np.searchsorted(self.depths, depth + _SHORTEST))
+        first = min(first, len(self.depths) - 1)
         tip = [np.interp(depth, self.depths, one) for one in self.tips.T]
         return PlannedPath(
             depths=np.append(depth, self.depths[first:]),

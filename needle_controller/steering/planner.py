@@ -7,6 +7,7 @@ from math import ceil
 from typing import Final
 
 from needle_controller.steering.guarded_law import GuardedLaw
+from needle_controller.steering.insertion_plan import Plan
 from needle_controller.steering.insertion_record import PlannedInsertion, SteeringRecord
 from needle_controller.steering.law import build_law, SteeringLaw
 from needle_controller.steering.planning import Job, Progress, StartJob
@@ -33,6 +34,7 @@ class InsertionPlanner:
     settings: ExecutiveSettings
     start_job: StartJob
     law: str
+    plan: Plan | None = None
     job: Job[SteeringLaw] | None = None  #: computation under way
     request: PlannedInsertion | None = None  #: its request
     recalled: SteeringRecord | None = None  #: record of the insertion before a restart
@@ -86,6 +88,11 @@ class InsertionPlanner:
     def _depths(self, request: PlannedInsertion, begun: float | None) -> FloatArray:
         """Return the depths of the steps, if an insertion can begin; the last began at a depth."""
         point, at, settings = request.point, request.at, self.settings
+        if self.plan is not None and abs(point[1] - self.plan.length) > _SAME:
+            raise ParameterError(
+                f'the plan is to a depth of {1e3 * self.plan.length:.3f} mm, the target at '
+                f'{1e3 * point[1]:.3f} mm'
+            )
         if at[0] < -_OUTSIDE:
             raise JobError(f'the needle is {-1e3 * at[0]:.2f} mm before the skin')
         depth, straight = max(0.0, float(at[0])), begun or 0.0
@@ -105,6 +112,8 @@ class InsertionPlanner:
                 f'the needle is at {1e3 * depth:.2f} mm already, the target at '
                 f'{1e3 * point[1]:.2f} mm'
             )
+        if self.plan is not None:
+            return self.plan.tip_path.since(depth).depths
         steps = max(1, ceil((point[1] - depth) / settings.step_length - _SAME))
         if steps > _MOST_STEPS:
             raise ParameterError(
@@ -119,7 +128,9 @@ class InsertionPlanner:
         x, _, z = request.point if record is None else record.point
         at = request.at if record is None else record.start
         limits = settings.limits(float(request.point[1] - depths[0]) / (len(depths) - 1))
-        roll = float(at[3]) if settings.turns else 0.0
+        roll, path = float(at[3]) if settings.turns else 0.0, None
+        if self.plan is not None:
+            roll, path = self.plan.roll, self.plan.tip_path.since(float(depths[0]))
 
         def work(progress: Progress) -> SteeringLaw:
             model = SteeringModel(
@@ -130,7 +141,7 @@ class InsertionPlanner:
                 together=settings.continuous,
                 progress=progress,
             )
-            return build_law(self.law, model, (x, z), limits, roll)
+            return build_law(self.law, model, (x, z), limits, roll, path)
 
         self.request, self.job = request, self.start_job(work)
 
@@ -162,3 +173,19 @@ def describe_target(point: tuple[float, float, float]) -> str:
     """Describe a target x, y, z [m] for users."""
     x, y, z = (1e3 * one for one in point)
     return f'x = {x:.2f} mm, z = {z:.2f} mm at a depth of {y:.2f} mm'
+
+
+def check_plan(plan: Plan, settings: ExecutiveSettings) -> None:
+    """Raise `ParameterError` if an insertion cannot follow a plan within its settings."""
+    travel = np.abs(np.diff(plan.guide, axis=0, prepend=0.0)).max()
+    for name, found in (('guide_limit', np.abs(plan.guide).max()), ('guide_step', travel)):
+        most = getattr(settings, name)
+        if found > most + _SAME:
+            raise ParameterError(
+                f'the plan needs {name} >= {1e3 * found:.3f} mm, got {1e3 * most:g} mm'
+            )
+    if plan.guide[0].any():
+        raise ParameterError('the plan must have a guide at zero in its first step')
+    for name in ('continuous', 'turns'):
+        if getattr(settings, name):
+            raise ParameterError(f'{name} must be 0 with a plan, got {getattr(settings, name)}')

@@ -11,13 +11,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, Final, TYPE_CHECKING
 
+from needle_controller.steering.insertion_plan import Plan, write_plan
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.needles import DEFAULT_NEEDLE
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import table
 from needle_planning.paths import SKIN_LIMIT
-from needle_planning.plan import Plan, write_plan
 from needle_planning.planner import find_plan
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import quantities

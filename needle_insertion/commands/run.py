@@ -20,6 +20,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'run the plant in real time instead of lock-step: it does not wait for nodes that a busy '
         'machine delays',
     )
+    parser.add_argument(
+        '--plan',
+        type=Path,
+        metavar='FILE',
+        help='plan of `needle plan -o`, which `target` without a position inserts along',
+    )
     parser.add_argument('--law', help='control law (default: from the parameter file)')
     parser.add_argument(
         '--params-file',
@@ -57,6 +63,7 @@ def run(options: argparse.Namespace) -> int:
     if options.output.exists():
         raise ParameterError(f'{options.output} exists; name another folder')
     check_folder(options.output)
+    plan = _plan(options)
     steers = options.needle is not None and find_needle(options.needle).bends
     file = options.params_file or config_file('steering.yaml' if steers else 'insertion.yaml')
     if not file.is_file():
@@ -67,11 +74,32 @@ def run(options: argparse.Namespace) -> int:
     compile_nodes()
     lockstep = not (options.hardware or options.realtime)
     with Graph(options.output / 'logs', shared=True) as graph:
-        session = Session(graph, nodes, file, lockstep=lockstep)
+        session = Session(graph, nodes, file, lockstep=lockstep, target=plan)
         session.run()
     if not options.no_recording:
         session.screen.say(f'recorded to {options.output / "bag"}')
     return 0
+
+
+def _plan(options: argparse.Namespace) -> tuple[float, float, float] | None:
+    """Read the plan and use its needle; return its target in the frame of the guide [m]."""
+    if options.plan is None:
+        return None
+    from needle_dynamics import find_needle
+    from needle_planning import read_plan
+
+    plan = read_plan(options.plan)
+    if options.needle not in (None, plan.needle):
+        raise ParameterError(
+            f'{options.plan} is a plan for the needle {plan.needle}, got --needle {options.needle}'
+        )
+    if not find_needle(plan.needle).bends:
+        raise ParameterError(
+            f'{options.plan} is a plan for {plan.needle}, a needle that does not bend'
+        )
+    options.needle = plan.needle
+    x, y, z = ((plan.target - plan.entry) @ plan.axes.T).tolist()
+    return x, y, z
 
 
 def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, Any]]:
@@ -80,6 +108,8 @@ def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, 
     nodes['controller'] = {**steered}
     if steers:
         nodes['steering'] = {}
+        if options.plan is not None:
+            nodes['steering']['plan'] = str(options.plan.resolve())
     if options.needle is not None:
         for values in nodes.values():
             values['needle'] = options.needle

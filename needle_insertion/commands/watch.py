@@ -11,8 +11,8 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
+from needle_controller.steering.insertion_plan import Plan, read_plan
 from needle_insertion.commands.common import add_flag, add_quantity, add_time, print_each
-from needle_planning.plan import Plan, read_plan
 from needle_ros.errors import ParameterError
 from needle_ros.process import ENDINGS
 

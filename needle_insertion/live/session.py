@@ -61,13 +61,20 @@ class Session:
 
     The keys of `nodes` are, in the order of their start: optionally `recorder` and `plant`,
     `controller`, and optionally `steering`. With `lockstep` the plant runs in lock-step, and the
-    nodes in its time.
+    nodes in its time. `target` is that of the word `target` without a position [m].
     """
 
     def __init__(
-        self, graph: Graph, nodes: Mapping[str, Mapping[str, Any]], file: Path, *, lockstep: bool
+        self,
+        graph: Graph,
+        nodes: Mapping[str, Mapping[str, Any]],
+        file: Path,
+        *,
+        lockstep: bool,
+        target: tuple[float, float, float] | None = None,
     ) -> None:
         self._graph, self._nodes, self._file, self._lockstep = graph, nodes, file, lockstep
+        self._target = target
         self._node, self.screen = graph.node('operator'), Screen()
         self._check_alone(own=0, discovery=1.0)
         self._operator, self._warnings = Operator(self._node), Warnings(self.screen.say)
@@ -81,7 +88,9 @@ class Session:
             # until all sensors have reported.
             witness = Witness(self._node, lambda sample: sample.time < WARM_UP, lockstep=True)
         processes, readings = self._bring_up(holds=witness is not None)
-        terminal = Terminal(self._graph, self._operator, readings, screen, self._warnings)
+        terminal = Terminal(
+            self._graph, self._operator, readings, screen, self._warnings, self._target
+        )
         terminal.begin(self._nodes)
         screen.say(f'on domain {self._graph.domain}; `help` lists the words')
         # Suspended, the session could not stop the needle.

@@ -114,9 +114,10 @@ class Terminal(Cmd):
         readings: Readings,
         screen: Screen,
         warnings: Warnings,
+        planned: tuple[float, float, float] | None = None,
     ) -> None:
         super().__init__()
-        self._warnings = warnings
+        self._warnings, self._planned = warnings, planned
         self._graph, self._operator, self._readings = graph, operator, readings
         self._screen, self._say = screen, screen.say
         screen.complete([*WORDS, *LAWS])
@@ -226,9 +227,9 @@ class Terminal(Cmd):
 
     def do_target(self, words: list[str]) -> None:
         aims = self._operator.aims
-        if not words:
+        if not words and self._planned is None:
             raise _unfit('target', words)
-        x, y, z = target(' '.join(words))
+        x, y, z = target(' '.join(words)) if words else self._planned or (0.0, 0.0, 0.0)
         if (x or z) and aims != STEERING:
             raise ParameterError(
                 f'a target off the axis needs a needle that bends: --needle {DEFAULT_NEEDLE}'

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_insertion.report.insertion import evenly
 from needle_insertion.report.page import Interactive
@@ -16,7 +17,6 @@ from needle_insertion.report.surface import Surface, surfaces
 from needle_planning.anatomy import Anatomy
 from needle_planning.chance import Chance
 from needle_planning.clearance import Clearance
-from needle_planning.plan import Plan
 from needle_planning.planned_needle import complete_needle
 import numpy as np
 

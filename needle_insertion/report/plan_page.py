@@ -8,6 +8,7 @@ from math import ceil
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics.arrays import FloatArray
 from needle_insertion.report.anatomy_view import AnatomyView
 from needle_insertion.report.content import Picture
@@ -27,7 +28,6 @@ from needle_insertion.report.section import (
 from needle_planning.anatomy import Anatomy, ROLES
 from needle_planning.chance import Chance
 from needle_planning.clearance import Clearance
-from needle_planning.plan import Plan
 from needle_planning.planned_needle import complete_needle, shafts
 from needle_ros.errors import ParameterError
 import numpy as np

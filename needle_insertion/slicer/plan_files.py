@@ -8,12 +8,12 @@ import json
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_insertion.report.insertion import evenly
 from needle_insertion.slicer.needle import MILLIMETERS
 from needle_planning.anatomy import Anatomy
 from needle_planning.clearance import Clearance
-from needle_planning.plan import Plan
 from needle_planning.planned_needle import complete_needle
 from needle_planning.voxels import SPACES
 from needle_ros.files import write_whole

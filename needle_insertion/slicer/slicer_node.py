@@ -13,11 +13,11 @@ from typing import Any, Final, TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseArray, PoseStamped, PoseWithCovarianceStamped
+from needle_controller.steering.insertion_plan import read_plan
 from needle_insertion.graph.messages import target_message
 from needle_insertion.slicer.link import Connection, LinkSettings
 from needle_insertion.slicer.needle import MILLIMETERS, NeedleView, NodeStates, Registration, Shape
 from needle_insertion.slicer.plan_files import planned_shape, PlannedShape
-from needle_planning.plan import read_plan
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.contract import Topic

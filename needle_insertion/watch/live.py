@@ -10,9 +10,9 @@ import json
 from time import monotonic
 from typing import Any, Final
 
+from needle_controller.steering.insertion_plan import Plan
 from needle_insertion.watch.recorded import Comparison, PagePlayback, ShownRecording
 from needle_insertion.watch.view import planned, RATE, SPAN, View
-from needle_planning.plan import Plan
 from needle_ros.errors import ParameterError
 
 PERIOD: Final = 1.0 / RATE  #: time between two frames [s]

@@ -5,8 +5,8 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from math import isfinite, sqrt
 from typing import Any, Final, NamedTuple
 
+from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics import FloatArray
-from needle_planning.plan import Plan
 from needle_ros import contract
 from needle_ros.errors import printable
 from needle_ros.files import DocumentError, read_document

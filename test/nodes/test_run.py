@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 import os
 from pathlib import Path
 import pty
@@ -15,11 +16,13 @@ import subprocess
 import sys
 import time
 
+from needle_controller.steering.insertion_plan import write_plan
 from needle_dynamics.plant_node import PlantNode
 from needle_identification.bags.bag import read_topic
 from needle_insertion.replay.rerun import verify
 import pytest
 from support.installed import ROOT
+from support.plans import bowed_plan
 from support.ros_graph import RosGraph
 
 #: Timeout of a start or a motion on a busy machine [s].
@@ -451,3 +454,42 @@ def test_invalid_command_is_reported(ros_graph: RosGraph, tmp_path: Path) -> Non
             typed.expect('needle> ')
         typed.type('quit\n')
         assert typed.process.wait(60.0) == 0
+
+
+def test_plan_is_inserted(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """`target` without a position sends the target of the plan, with the needle of the plan."""
+    plan = bowed_plan()
+    write_plan(plan, tmp_path / 'plan.yaml')
+    script = ['target', 'wait', 'quit']
+    words = '--plan', str(tmp_path / 'plan.yaml'), '--no-recording'
+    status, output, errors = told(ros_graph, tmp_path / 'run', script, *words, rate=None)
+    assert status == 0, errors
+    found = re.search(r'steering: done: the tip is at .* (\d+\.\d+) mm from the target', output)
+    assert found
+    # The estimated tip, with the noise of the tracker and the remaining uncertainty of the tissue.
+    assert float(found[1]) < 0.5
+
+
+@pytest.mark.parametrize(
+    ('needle', 'words', 'message'),
+    [
+        ('phantom', (), 'is a plan for phantom, a needle that does not bend'),
+        (
+            'bending_35mm',
+            ('--needle', 'phantom'),
+            'is a plan for the needle bending_35mm, got --n',
+        ),
+        (None, (), 'cannot be read: No such file or directory'),
+    ],
+)
+def test_plan_that_cannot_be_run_is_rejected_by_a_line(
+    ros_graph: RosGraph, tmp_path: Path, needle: str | None, words: Sequence[str], message: str
+) -> None:
+    """Before a node is started."""
+    file = tmp_path / 'plan.yaml'
+    if needle is not None:
+        write_plan(replace(bowed_plan(), needle=needle), file)
+    status, _, errors = told(ros_graph, tmp_path / 'run', [], '--plan', str(file), *words)
+    assert status == 2
+    assert message in errors
+    assert len(errors.splitlines()) == 1

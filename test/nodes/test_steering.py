@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -14,9 +15,11 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.controller_node import ControllerNode
+from needle_controller.steering.insertion_plan import write_plan
 from needle_controller.steering.law import STEERING_LAWS
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_controller.steering_node import SteeringNode
+from needle_dynamics import NEEDLES
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.requests import Verdict
@@ -28,6 +31,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.installed import ROOT
+from support.plans import bowed_plan, CLEARANCE
 from support.ros_graph import RosGraph
 from trajectory_msgs.msg import JointTrajectory
 
@@ -583,3 +587,44 @@ def test_killed_node_resumes_its_insertion(ros_graph: RosGraph) -> None:
     assert kill.at('insertion') == pytest.approx(TARGET[1], abs=5e-4)
     # Another subscription than that of the phase.
     ros_graph.spin_until(lambda: said('mm from the target'), 'the result')
+
+
+def test_insertion_along_a_plan(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """The tip stays in the free tube around the bowed path, and ends at the target."""
+    plan, file = bowed_plan(), tmp_path / 'plan.yaml'
+    write_plan(plan, file)
+    bench = Bench(ros_graph, plan=str(file), guide_step=3e-3)
+    truth = ros_graph.listen(bench.user, JointState, 'ground_truth', SENSOR)
+    path = plan.tip_path
+    x, z = path.tips[-1].tolist()
+    bench.aim((x, plan.length, z))
+    assert bench.end() is SteeringPhase.DONE, bench.said
+    assert bench.status.steps == len(plan.guide)
+    names = 'd', 'tip_x', 'tip_z'
+    rows = np.array([[one.position[one.name.index(n)] for n in names] for one in truth])
+    depths = NEEDLES[plan.needle].needle.length - rows[:, 0]
+    planned = np.array([np.interp(depths, path.depths, one) for one in path.tips.T]).T
+    off = np.hypot(*(rows[:, 1:] - planned).T)
+    assert off.max() < CLEARANCE
+    # Remaining uncertainty of tissue and tilt.
+    assert off[-1] < 5e-4
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'needle': 'phantom'}, 'is a plan for the needle phantom, got bending_35mm'),
+        ({'guide': np.full((12, 2), 1e-2)}, 'the plan needs guide_limit >= 10.000 mm, got 6 mm'),
+        ({'depths': np.linspace(0.06, 0.0, 13)}, 'depths must increase from 0 m'),
+    ],
+)
+def test_plan_that_cannot_be_used_is_rejected_by_a_line(
+    ros_graph: RosGraph, tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    """Of another needle, outside the limits, or damaged: the node is not configured."""
+    file = tmp_path / 'plan.yaml'
+    write_plan(replace(bowed_plan(), **change), file)
+    node = ros_graph.add(SteeringNode, start=False, parameters={'plan': str(file)})
+    assert not node.start()
+    assert message in node.failure
+    assert '\n' not in node.failure

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from needle_controller.steering.insertion_plan import guide_axes
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics import find_needle, FloatArray, NEEDLES, SteeredNeedle
 from needle_dynamics.needles import NeedlePreset
@@ -12,7 +13,6 @@ from needle_planning.clearance import Clearance
 from needle_planning.paths import (
     best_bow,
     bow_profile,
-    guide_axes,
     inserted_shape,
     Line,
     needle_radius,

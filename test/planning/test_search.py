@@ -471,6 +471,7 @@ def test_plan_file_is_the_plan(tmp_path: Path) -> None:
         ('target: [', 'target: [.nan, 0, 0]\nother: [', 'target must have 3 finite numbers'),
         ('depths: [', 'depths: [0.0, ', 'depths must have .* finite numbers'),
         ('guide:', 'guides:', 'must have .* finite numbers'),
+        ('depths: [0.0', 'depths: [1.0', 'depths must increase from 0 m'),
         ('frame:', '\tframe:', 'cannot be read: is not YAML'),
     ],
 )

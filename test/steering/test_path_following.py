@@ -91,7 +91,7 @@ def test_moved_target_moves_the_path_in_proportion_to_the_depth() -> None:
 
 def test_path_may_begin_at_any_depth() -> None:
     """A later path has the same waypoints and setpoints; the first is between two of them."""
-    for depth, steps in ((0.0, 16), (0.004, 16), (0.005, 15), (0.0751, 1)):
+    for depth, steps in ((0.0, 16), (0.003, 16), (0.0045, 15), (0.005, 15), (0.0751, 1)):
         path = PATH.since(depth)
         assert len(path.guide) == len(path.tips) - 1 == len(path.depths) - 1 == steps
         assert path.depths[0] == depth

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import Final
 
+from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics import FloatArray
 from needle_planning.anatomy import Anatomy, Structure
-from needle_planning.plan import Plan
 import numpy as np
 from numpy.typing import ArrayLike
 

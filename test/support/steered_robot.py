@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrior
+from needle_controller.steering.insertion_plan import Plan
 from needle_controller.steering.law import DEFAULT_LAW
 from needle_controller.steering.motion import JointMotion
 from needle_dynamics import NEEDLES, SteeredNeedle
@@ -36,10 +37,17 @@ class Robot:
         own: ExecutiveSettings = SETTINGS,
         prior: SteeringPrior | None = None,
         law: str = DEFAULT_LAW,
+        plan: Plan | None = None,
     ) -> None:
         self.seconds = 0.0
         self.loop = SteeringExecutive(
-            NEEDLE, STEERING, prior or SteeringPrior(), own, steady=lambda: self.seconds, law=law
+            NEEDLE,
+            STEERING,
+            prior or SteeringPrior(),
+            own,
+            steady=lambda: self.seconds,
+            law=law,
+            plan=plan,
         )
         softer = replace(NEEDLE, tissue_stiffness=0.6 * NEEDLE.tissue_stiffness)
         self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))

@@ -11,14 +11,13 @@ from typing import Any, Final
 from needle_controller.steering.planned_path import PlannedPath
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.display import Displayed
-from needle_planning.layers import MOST_LAYERS
-from needle_planning.paths import guide_axes
 from needle_ros.errors import ParameterError
 from needle_ros.files import read_document, write_whole
 from needle_ros.settings import is_number
 import numpy as np
 import yaml
 
+MOST_LAYERS: Final = 8  #: Most layers of tissue along a line.
 _FORMAT: Final = 1  #: Version of the file.
 
 
@@ -79,6 +78,20 @@ class Plan(Displayed):
             'tip_s [m]': self.path[:, 2],
             'clearance [m]': self.clearances,
         }
+
+
+def guide_axes(direction: FloatArray) -> FloatArray:
+    """
+    Return the axes x, y, z of the guide in patient coordinates, rows, shape (3, 3).
+
+    y is the direction of the insertion, z points up (S) as far as possible, or to the front (A)
+    for an insertion along the body axis.
+    """
+    y = direction / np.linalg.norm(direction)
+    up = np.array([0.0, 0.0, 1.0]) if abs(y[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    z = up - (up @ y) * y
+    z /= np.linalg.norm(z)
+    return np.stack([np.cross(y, z), y, z])
 
 
 def write_plan(plan: Plan, path: Path | str, simulation: Mapping[str, Any] | None = None) -> None:
@@ -149,7 +162,12 @@ def read_plan(path: Path | str) -> Plan:
         elif not is_number(value):
             raise ParameterError(f'{path}: {item.name} must be a number, got {value!r}')
         values[item.name] = value
-    return Plan(**values)
+    plan = Plan(**values)
+    if plan.depths[0] != 0.0 or (np.diff(plan.depths) <= 0.0).any():
+        raise ParameterError(f'{path}: depths must increase from 0 m')
+    if not np.linalg.norm(plan.direction) > 0.0:
+        raise ParameterError(f'{path}: direction must not be zero')
+    return plan
 
 
 def _length_of(value: object) -> int:

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plan of a bowed needle, without an image."""
+
+from __future__ import annotations
+
+from needle_controller.steering.insertion_plan import guide_axes, Plan
+from needle_dynamics import NEEDLES, SteeredNeedle
+import numpy as np
+
+NEEDLE, STEERING, _ = NEEDLES['bending_35mm']
+CLEARANCE = 1.5e-3  #: Radius of the free tube around the path [m].
+
+
+def bowed_plan(length: float = 0.06, steps: int = 12, bow: float = 3e-3) -> Plan:
+    """Return a plan in a tube around a path bowed in x, with guide positions up to a bow [m]."""
+    depths = np.linspace(0.0, length, steps + 1)
+    guide = np.zeros((steps, 2))
+    guide[1:, 0] = bow * np.sin(np.linspace(0.3, 4.0, steps - 1))
+    needle = SteeredNeedle(NEEDLE, STEERING)
+    tips = [needle.tip]
+    for depth, setpoint in zip(depths[1:].tolist(), guide, strict=True):
+        needle.move(guide=setpoint.tolist())
+        needle.move(depth=depth)
+        tips.append(needle.tip)
+    entry, direction = np.array([0.1, 0.02, 0.03]), np.array([-1.0, 0.0, 0.0])
+    path = entry + np.array(tips) @ guide_axes(direction)
+    return Plan(
+        needle='bending_35mm', radius=6e-4, entry=entry, direction=direction, target=path[-1],
+        roll=0.0, depths=depths, guide=guide, path=path, clearances=np.full(steps + 1, CLEARANCE),
+        clearance=CLEARANCE, structure='tube', place=path[steps // 2],
+        bow=float(np.abs(np.array(tips)[:, 0]).max()), resolution=5e-4, straight_bound=0.0,
+        bound=CLEARANCE,
+    )  # fmt: skip
