@@ -10,7 +10,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from needle_controller.steering.executive import SteeringExecutive
-from needle_controller.steering.insertion_plan import read_plan
+from needle_controller.steering.insertion_plan import in_layers, read_plan
 from needle_controller.steering.insertion_record import RecordFile, SteeringRecord
 from needle_controller.steering.law import DEFAULT_LAW, find_law, STEERING_LAWS, TipEstimate
 from needle_controller.steering.motion import JointMotion
@@ -141,6 +141,8 @@ class SteeringNode(CompiledNode):
         plan = read_plan(file) if (file := self.text(_PLAN)) else None
         if plan is not None and plan.needle != name:
             raise ParameterError(f'{file} is a plan for the needle {plan.needle}, got {name}')
+        if plan is not None:
+            needle, steering, prior = in_layers(plan.layers, needle, steering, prior)
         self._loop = SteeringExecutive(
             needle, steering, prior, settings, start=ThreadJob, law=law, plan=plan
         )

@@ -4,16 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import groupby
 from math import ceil, isfinite
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from needle_controller.steering.insertion_plan import MOST_LAYERS
-from needle_controller.steering.settings import SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.steering.parameters import SteeringParameters
 from needle_planning.anatomy import Anatomy
 from needle_planning.clearance import image_frame
 import numpy as np
@@ -21,16 +18,6 @@ import numpy as np
 _SPACING: Final = 1e-4  #: Spacing of the points of a line whose labels are read [m].
 _LEAST: Final = 1e-3  #: Least stiffness [N/m^2]: its logarithm is finite.
 _WIDEST: Final = 2.0  #: Largest spread of a prior.
-#: Constants of `SteeringParameters` with one value for each layer.
-_BY_LAYER: Final = 'bevel_load', 'cutting_force', 'coulomb_per_length', 'viscous_per_length'
-
-
-class LayeredTissue(NamedTuple):
-    """Needle in the layers of a plan, and the prior uncertainty of these layers."""
-
-    needle: NeedleParameters
-    steering: SteeringParameters
-    prior: SteeringPrior
 
 
 class _Tissue(NamedTuple):
@@ -106,34 +93,3 @@ def _merged(parts: FloatArray) -> FloatArray:
     variance = sizes[both] @ (parts[both, 2] ** 2 + (logs[both] - mean) ** 2) / size
     one = size, np.exp(mean), min(np.sqrt(variance), _WIDEST)
     return np.vstack([parts[:k], one, parts[k + 2 :]])
-
-
-def in_layers(
-    layers: FloatArray,
-    needle: NeedleParameters,
-    steering: SteeringParameters,
-    prior: SteeringPrior | None = None,
-) -> LayeredTissue:
-    """Return a needle of a needle file, and a prior, in layers of `tissue_layers`."""
-    prior = prior or SteeringPrior()
-    if not len(layers):
-        return LayeredTissue(needle, steering, prior)
-    starts, stiffnesses, spreads = layers.T
-    own = np.searchsorted(needle.tissue.starts, starts, side='right') - 1
-    values = {name: getattr(steering, name) for name in _BY_LAYER}
-    found: dict[str, Any] = {
-        name: tuple(several[k] for k in own)
-        for name, several in values.items()
-        if len(several) > 1
-    }
-    (first, *others), (_, *borders) = stiffnesses.tolist(), starts.tolist()
-    return LayeredTissue(
-        replace(
-            needle,
-            tissue_stiffness=first,
-            layer_depths=tuple(borders),
-            layer_stiffnesses=tuple(others),
-        ),
-        replace(steering, **found),
-        replace(prior, layer_spread=tuple(spreads.tolist())) if spreads.any() else prior,
-    )

@@ -16,7 +16,13 @@ from math import ceil, cos, hypot, pi, sin
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from needle_controller.steering.insertion_plan import MOST_LAYERS, Plan, read_plan, write_plan
+from needle_controller.steering.insertion_plan import (
+    in_layers,
+    MOST_LAYERS,
+    Plan,
+    read_plan,
+    write_plan,
+)
 from needle_controller.steering.law import (
     build_law,
     DEFAULT_LAW,
@@ -41,7 +47,6 @@ from needle_dynamics.steering.parameters import SteeringParameters, with_layers,
 from needle_planning.anatomy import Anatomy, Structure
 from needle_planning.certificate import least_clearances, sag_of
 from needle_planning.clearance import Clearance
-from needle_planning.layers import in_layers
 from needle_planning.paths import inserted_shape, Line
 from needle_ros.errors import ParameterError
 from needle_ros.settings import from_values

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from math import inf, isfinite
 from typing import Final, TypeAlias
 
-from needle_controller.steering.insertion_plan import guide_axes, Plan
+from needle_controller.steering.insertion_plan import guide_axes, in_layers, Plan
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle, NeedlePreset
@@ -16,7 +16,7 @@ from needle_dynamics.steering.parameters import SteeringParameters
 from needle_planning.anatomy import Anatomy
 from needle_planning.certificate import simulate_insertion, SimulatedInsertion
 from needle_planning.clearance import Clearance, image_frame
-from needle_planning.layers import in_layers, tissue_layers
+from needle_planning.layers import tissue_layers
 from needle_planning.paths import (
     best_bow,
     bow_profile,

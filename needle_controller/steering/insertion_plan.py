@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from needle_controller.steering.planned_path import PlannedPath
+from needle_controller.steering.settings import SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.display import Displayed
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.errors import ParameterError
 from needle_ros.files import read_document, write_whole
 from needle_ros.settings import is_number
@@ -19,6 +22,8 @@ import yaml
 
 MOST_LAYERS: Final = 8  #: Most layers of tissue along a line.
 _FORMAT: Final = 1  #: Version of the file.
+#: Constants of `SteeringParameters` with one value for each layer.
+_BY_LAYER: Final = 'bevel_load', 'cutting_force', 'coulomb_per_length', 'viscous_per_length'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -198,3 +203,42 @@ def _array(name: str, value: object, shape: tuple[int, ...]) -> FloatArray:
         size = ' x '.join(map(str, shape))
         raise ParameterError(f'{name} must have {size} finite numbers')
     return found
+
+
+class LayeredTissue(NamedTuple):
+    """Needle in the layers of a plan, and the prior uncertainty of these layers."""
+
+    needle: NeedleParameters
+    steering: SteeringParameters
+    prior: SteeringPrior
+
+
+def in_layers(
+    layers: FloatArray,
+    needle: NeedleParameters,
+    steering: SteeringParameters,
+    prior: SteeringPrior | None = None,
+) -> LayeredTissue:
+    """Return a needle of a needle file, and a prior, in layers of a plan."""
+    prior = prior or SteeringPrior()
+    if not len(layers):
+        return LayeredTissue(needle, steering, prior)
+    starts, stiffnesses, spreads = layers.T
+    own = np.searchsorted(needle.tissue.starts, starts, side='right') - 1
+    values = {name: getattr(steering, name) for name in _BY_LAYER}
+    found: dict[str, Any] = {
+        name: tuple(several[k] for k in own)
+        for name, several in values.items()
+        if len(several) > 1
+    }
+    (first, *others), (_, *borders) = stiffnesses.tolist(), starts.tolist()
+    return LayeredTissue(
+        replace(
+            needle,
+            tissue_stiffness=first,
+            layer_depths=tuple(borders),
+            layer_stiffnesses=tuple(others),
+        ),
+        replace(steering, **found),
+        replace(prior, layer_spread=tuple(spreads.tolist())) if spreads.any() else prior,
+    )

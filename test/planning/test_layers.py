@@ -8,10 +8,10 @@ from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from needle_controller.steering.insertion_plan import MOST_LAYERS, read_plan, write_plan
+from needle_controller.steering.insertion_plan import in_layers, MOST_LAYERS, read_plan, write_plan
 from needle_dynamics import find_needle, SteeredNeedle, SteeringParameters
 from needle_planning import Anatomy, chance_of, find_plan, Structure
-from needle_planning.layers import in_layers, tissue_layers
+from needle_planning.layers import tissue_layers
 from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
