@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
-from needle_controller.steering.insertion_plan import Plan
+from needle_controller.steering.insertion_plan import in_layers, Plan
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import find_needle
 from needle_dynamics.steering.needle import SteeredNeedle
@@ -42,7 +42,8 @@ def shafts(plan: Plan, outside: float = 0.0) -> Iterator[FloatArray]:
         The needle is unknown, or at the end not at the tip of the plan.
 
     """
-    needle, steering, _ = find_needle(plan.needle)
+    preset = find_needle(plan.needle)
+    needle, steering, _ = in_layers(plan.layers, preset.needle, preset.steering)
     one = SteeredNeedle(needle, replace(steering, path_noise=0.0), roll=plan.roll)
     line, start = Line(plan.entry, plan.axes), -min(outside, steering.free_length)
 
