@@ -87,7 +87,8 @@ class Batches:
         force, torque = np.array([[FORCE]]), np.zeros((1, 1))
         inputs = lanes.BatchTrajectory(force, torque, 1, DURATION, _STEP, True)
         kept, completed = np.empty((len(ends), 1, ends.shape[1])), np.empty(len(ends))
-        lanes.run(needles, modes, layers, inputs, np.arange(len(ends)), ends, kept, completed)
+        given = needles, modes, layers, inputs, np.arange(len(ends)), ends, kept, completed
+        lanes.run(lanes.LaneBatch(*given))
         return ends
 
     def one_by_one(self) -> FloatArray:

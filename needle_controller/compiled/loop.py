@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Closed loop of a sampled law and the simulated needle, for batches of runs."""
 
+from typing import NamedTuple
+
 from needle_controller.compiled.laws import (
     adapt,
     answer,
@@ -149,37 +151,37 @@ def run_loop(
     return int(count)
 
 
-@inlined
-def run_lanes_with(
-    rotate: Rotation,
-    needles: Matrix,
-    modes: LaneModes,
-    layers: Array3,
-    law: LawTuple,
-    limit: float,
-    setpoints: Array3,
-    goal: Matrix,
-    counts: IntVector,
-    delays: IntVector,
-    known: int,
-    noise: Array3,
-    longest: float,
-    which: IntVector,
-    starts: Matrix,
-    motions: Array3,
-    commands: Matrix,
-    completed: Vector,
-) -> None:
-    """
-    Run a law with up to as many needles as lanes as `run_loop`, several with each instruction.
+class LaneLoop(NamedTuple):
+    """Needles of closed loops, their inputs, and results; as for `run_loop` if not described."""
 
-    Arrays are as for `run_loop` with a leading axis of runs, in falling order of the periods
-    ``counts``, and long enough for all. ``which`` has the rows of the runs to compute.
-    ``needles``, ``modes`` and ``layers`` are as for `lanes.run`. ``delays`` are the periods until
-    a command acts, before which no force acts, and ``starts`` the initial states. ``motions``,
-    shape (runs, 3, k + 1), takes insertion depth, velocity and tip deflection at the
-    measurements, ``completed`` the periods.
-    """
+    #: As in `lanes.LaneBatch`.
+    needles: Matrix
+    modes: LaneModes
+    layers: Array3
+    law: LawTuple
+    limit: float
+    #: With a leading axis of runs, in falling order of the periods, and long enough for all.
+    setpoints: Array3
+    goal: Matrix
+    counts: IntVector  #: periods of each run
+    delays: IntVector  #: periods until a command acts, before which no force acts
+    known: int
+    noise: Array3
+    longest: float
+    which: IntVector  #: rows of the runs to compute, at most one for each lane
+    starts: Matrix  #: initial states
+    #: Results: insertion depth, velocity and tip deflection at the measurements, shape
+    #: (runs, 3, k + 1); commands; completed periods.
+    motions: Array3
+    commands: Matrix
+    completed: Vector
+
+
+@inlined
+def run_lanes_with(rotate: Rotation, loop: LaneLoop) -> None:
+    """Run a law with needles in lanes as `run_loop`; ``rotate`` advances their modes."""
+    needles, modes, layers, law, limit, setpoints, goal, counts, delays = loop[:9]
+    known, noise, longest, which, starts, motions, commands, completed = loop[9:]
     n, period = len(which), LawConstants(*law).period
     w, memory, acts = empty_lanes(modes), np.zeros((n, MEMORY)), np.zeros(n)
     waited, inside = np.zeros(n, dtype=np.int64), np.ones(n, dtype=np.bool_)
@@ -225,30 +227,9 @@ def run_lanes_with(
 
 
 @kernel
-def run_lanes(
-    needles: Matrix,
-    modes: LaneModes,
-    layers: Array3,
-    law: LawTuple,
-    limit: float,
-    setpoints: Array3,
-    goal: Matrix,
-    counts: IntVector,
-    delays: IntVector,
-    known: int,
-    noise: Array3,
-    longest: float,
-    which: IntVector,
-    starts: Matrix,
-    motions: Array3,
-    commands: Matrix,
-    completed: Vector,
-) -> None:
+def run_lanes(loop: LaneLoop) -> None:
     """Run `run_lanes_with` for needles with one or two modes."""
-    run_lanes_with(
-        rotate_two_lanes, needles, modes, layers, law, limit, setpoints, goal, counts, delays,
-        known, noise, longest, which, starts, motions, commands, completed,
-    )  # fmt: skip
+    run_lanes_with(rotate_two_lanes, loop)
 
 
 @inlined

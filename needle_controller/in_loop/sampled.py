@@ -9,7 +9,7 @@ from itertools import chain, repeat
 from math import isfinite
 from typing import Final, NamedTuple, Protocol
 
-from needle_controller.compiled.loop import run_lanes, run_loop
+from needle_controller.compiled.loop import LaneLoop, run_lanes, run_loop
 from needle_controller.compiled.many_loop import run_many_lanes
 from needle_controller.controller import ControllerOutput, Measurement
 from needle_controller.in_loop.run import LoopRun
@@ -333,11 +333,11 @@ def run_insertions(
         if reach is not None:
             for part in np.split(some, range(LANES, len(some), LANES)):
                 advance = run_many_lanes if modes > 2 else run_lanes
-                advance(
+                advance(LaneLoop(
                     lane_constants(parameters), lane_modes(reach, modes), layers, law.packed,
-                    limit, setpoints, goal, counts, delays, delay, blurred, step, part, wide,
-                    motions, commands, completed,
-                )  # fmt: skip
+                    float(limit), setpoints, goal, counts, delays, delay, blurred, step, part,
+                    wide, motions, commands, completed,
+                ))  # fmt: skip
             continue
         for k in some.tolist():
             n, model = counts[k], chosen[k]

@@ -112,6 +112,23 @@ class BatchTrajectory(NamedTuple):
     graded: bool  #: let steps grow with the insertion depth, as in `Integrator`
 
 
+class LaneBatch(NamedTuple):
+    """Needles of a batch, their inputs, and results."""
+
+    needles: Matrix  #: `Constants`, shape (all or 1, 19)
+    modes: LaneModes
+    #: Layers of the tissue, shape (all or 1, m, `LAYER` + pairs of modes), with m = 0 if all
+    #: needles are in one that does not swell.
+    layers: Array3
+    trajectory: BatchTrajectory
+    runs: IntVector  #: indices of the runs to compute
+    states: Matrix  #: initial states, replaced by those at the end, shape (all, 2 (2 + n))
+    #: States at the ends of the intervals, shape (all, count + 1, 2 (2 + n)); unused if it has
+    #: one row per run.
+    kept: Array3
+    completed: Vector  #: completed intervals, shape (all,)
+
+
 @compiled
 def _begin(w: FloatArray, n: int, layers: FloatArray, longest: float, grade: float) -> None:
     """Compute the step of each lane, the depth in its middle, and the tissue there."""
@@ -377,24 +394,9 @@ def save_lane(w: FloatArray, i: int, modes: LaneModes, state: FloatArray) -> Non
 
 
 @inlined
-def run_with(
-    rotate: Rotation,
-    needles: Matrix,
-    modes: LaneModes,
-    layers: Array3,
-    trajectory: BatchTrajectory,
-    runs: IntVector,
-    states: Matrix,
-    kept: Array3,
-    completed: Vector,
-) -> None:
+def run_with(rotate: Rotation, batch: LaneBatch) -> None:
     """Advance needles through intervals of constant inputs; ``rotate`` advances their modes."""
-    # ``needles``, shape (all or 1, 19), are `Constants`; ``layers``, shape (all or 1, m, `LAYER` +
-    # pairs of modes), the layers of the tissue, with m = 0 if all needles are in one that does not
-    # swell; ``runs`` the indices of the runs to compute.
-    # Outputs: ``states``, shape (all, 2 (2 + n)) with n = 2 or 4 modes, at the end; ``kept``,
-    # shape (all, count + 1, 2 (2 + n)), at the ends of the intervals (unused if it has one row per
-    # run); ``completed``, shape (all,), intervals.
+    needles, modes, layers, trajectory, runs, states, kept, completed = batch
     w = empty_lanes(modes)
     # Run and interval of each lane.
     which, at = np.zeros(LANES, dtype=np.int64), np.zeros(LANES, dtype=np.int64)
@@ -429,18 +431,9 @@ def run_with(
 
 
 @kernel
-def run(
-    needles: Matrix,
-    modes: LaneModes,
-    layers: Array3,
-    trajectory: BatchTrajectory,
-    runs: IntVector,
-    states: Matrix,
-    kept: Array3,
-    completed: Vector,
-) -> None:
+def run(batch: LaneBatch) -> None:
     """Run `run_with` for needles with one or two modes."""
-    run_with(rotate_two_lanes, needles, modes, layers, trajectory, runs, states, kept, completed)
+    run_with(rotate_two_lanes, batch)
 
 
 @inlined

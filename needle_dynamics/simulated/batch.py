@@ -239,7 +239,8 @@ def _take(
 
     def together(needles: FloatArray, modes: LaneModes, some: IntArray) -> None:
         advance = run_many if modes.number > 2 else lanes.run
-        advance(needles, modes, layers, inputs, some, wide, wide_kept, completed)
+        given = needles, modes, layers, inputs, some, wide, wide_kept, completed
+        advance(lanes.LaneBatch(*given))
         for _ in some:
             progress()
 
