@@ -58,11 +58,12 @@ def test_two_arcs_connect_two_directions() -> None:
         start, end = np.zeros(3), np.array([0.0, 0.0, 0.05]) + rng.normal(0.0, 5e-3, 3)
         t, u = (unit(np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 0.1, 3)) for _ in range(2))
         one, other = biarc(start, t, end, u)
-        assert one.end == pytest.approx(other.start, abs=1e-12)
-        assert one.axes_at_end()[0] == pytest.approx(other.tangent, abs=1e-9)
-        # The end follows from rounding of two arcs of 25 mm.
-        assert other.end == pytest.approx(end, abs=1e-9)
-        assert other.axes_at_end()[0] == pytest.approx(u, abs=1e-6)
+        # Rounding: 2e-17 m in positions of 0.05 m, and up to 2e-15 in directions, which are
+        # differences of points over their distance.
+        assert one.end == pytest.approx(other.start, abs=1e-15)
+        assert one.axes_at_end()[0] == pytest.approx(other.tangent, abs=1e-13)
+        assert other.end == pytest.approx(end, abs=1e-15)
+        assert other.axes_at_end()[0] == pytest.approx(u, abs=1e-13)
 
 
 @pytest.mark.parametrize('curvature', [0.0, 0.7, 5.0])
@@ -70,19 +71,23 @@ def test_arc_between_two_points_has_its_curvature(curvature: float) -> None:
     """
     The angle between its ends is curvature times length; reversed twice it is the same.
 
-    A straight arc has a radius of 1000 km: 5 nm.
+    Up to rounding. Points of a straight arc are on a radius of 1000 km, 4 nm beside the line at
+    its end, and twice as far after two of them.
     """
+    apart = 1e-8 if curvature == 0.0 else 1e-15
     entry, target = np.array([0.01, 0.0, 0.09]), np.array([0.0, 0.02, 0.0])
     arc = bowed_arc(entry, target, curvature * np.array([0.6, -0.8]))
-    assert arc.curvature == pytest.approx(curvature, abs=1e-9)
-    assert arc.end == pytest.approx(target, abs=1e-8)
+    # A rounding of 1e-17 m across a chord of 0.1 m is a curvature of 1e-15 /m.
+    assert arc.curvature == pytest.approx(curvature, abs=1e-13)
+    assert arc.end == pytest.approx(target, abs=apart)
     angle = np.arccos(min(1.0, float(arc.tangent @ arc.axes_at_end()[0])))
-    assert angle == pytest.approx(curvature * arc.length, abs=1e-6)
+    # The arc cosine of an angle of 0.06 multiplies rounding by 16.
+    assert angle == pytest.approx(curvature * arc.length, abs=1e-13)
     again = arc.reverse().reverse()
-    assert again.start == pytest.approx(entry, abs=1e-8)
-    assert again.tangent == pytest.approx(arc.tangent, abs=1e-8)
+    assert again.start == pytest.approx(entry, abs=apart)
+    assert again.tangent == pytest.approx(arc.tangent, abs=1e-15)
     steps = np.linspace(0.0, arc.length, 9)
-    assert arc.reverse().points(steps) == pytest.approx(arc.points(steps)[::-1], abs=1e-8)
+    assert arc.reverse().points(steps) == pytest.approx(arc.points(steps)[::-1], abs=apart)
 
 
 def test_no_arc_of_a_dense_grid_is_better() -> None:
