@@ -64,19 +64,21 @@ _SWEEPS: Final = 5
 
 
 @compiled
-def _evaluate(r: FloatArray, i: int, table: FloatArray, xi: float) -> None:
-    """Evaluate the table at a relative depth of a lane."""
-    columns = table.shape[1]
-    place = xi * PIECES
-    piece = min(int(place), table.shape[0] // TERMS - 1)
-    x, first = 2.0 * (place - piece) - 1.0, piece * TERMS
-    at = table[first].copy()
-    for m in range(first + 1, first + TERMS):
-        row = table[m]
-        for j in range(columns):
-            at[j] = at[j] * x + row[j]
-    for j in range(columns):
-        r[_AT + j, i] = at[j]
+def _evaluate(r: FloatArray, first: int, end: int, table: FloatArray) -> None:
+    """Evaluate the table at the relative depths of some lanes."""
+    at, last = np.empty(table.shape[1]), table.shape[0] // TERMS - 1
+    for i in range(first, end):
+        place = r[XI // LANES, i] * PIECES
+        piece = min(int(place), last)
+        x, top = 2.0 * (place - piece) - 1.0, piece * TERMS
+        for j in range(at.shape[0]):
+            at[j] = table[top, j]
+        for m in range(top + 1, top + TERMS):
+            row = table[m]
+            for j in range(at.shape[0]):
+                at[j] = at[j] * x + row[j]
+        for j in range(at.shape[0]):
+            r[_AT + j, i] = at[j]
 
 
 @compiled
@@ -390,8 +392,7 @@ def _start(n: int, r: FloatArray, m: int) -> None:
 def rotate_many_lanes(w: FloatArray, n: int, modes: LaneModes) -> None:
     """Advance the deflections through the step of each lane."""
     r, m, table = w.reshape(-1, LANES), modes.number, modes.table
-    for i in range(n):
-        _evaluate(r, i, table, w[XI + i])
+    _evaluate(r, 0, n, table)
     _factor(n, r, m)
     _stiffness(n, r, m)
     _diagonalize(n, r, m)
@@ -434,10 +435,9 @@ def end_many_lanes(w: FloatArray, n: int, m: int) -> None:
 def tip_many_lanes(w: FloatArray, n: int, m: int, table: FloatArray) -> None:
     """Compute the tip deflection of each lane at the relative depth of its row."""
     r = w.reshape(-1, LANES)
+    _evaluate(r, 0, n, table)
     for i in range(n):
-        xi = w[XI + i]
-        _evaluate(r, i, table, xi)
-        tip = 0.0
+        xi, tip = w[XI + i], 0.0
         for p in range(m):
             tip += r[_AT + m * (m + 1) + p, i] * w[Q1 + p * LANES + i]
         w[TIP + i] = xi * xi * tip / sqrt(w[LENGTH + i])
@@ -447,8 +447,8 @@ def tip_many_lanes(w: FloatArray, n: int, m: int, table: FloatArray) -> None:
 def _mass(w: FloatArray, i: int, m: int, table: FloatArray) -> FloatArray:
     """Compute the mass rho G (m, m) of a lane at its depth."""
     r, mass, pair = w.reshape(-1, LANES), np.empty((m, m)), 0
-    xi = w[DEPTH + i] / w[LENGTH + i]
-    _evaluate(r, i, table, xi)
+    w[XI + i] = xi = w[DEPTH + i] / w[LENGTH + i]
+    _evaluate(r, i, i + 1, table)
     for p in range(m):
         for q in range(p, m):
             gram = xi * xi * xi * xi * xi * r[_AT + pair, i]
