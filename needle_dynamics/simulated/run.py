@@ -254,11 +254,11 @@ def follow(path: JointPath, moved: Sequence[str], plant_run: PlantRun, elapsed: 
 
 
 class _Execution(NamedTuple):
-    """Path that some of its joints follow, and its start [ns]."""
+    """Path that some of its joints follow, and its start in the time of the plant [s]."""
 
     path: JointPath
     joints: frozenset[str]
-    begun: int
+    begun: float
 
 
 class Executions:
@@ -274,7 +274,7 @@ class Executions:
         self.period = round(NANOSECONDS / plant_run.constants.own.rate)
         self._running: list[_Execution] = []
         self._held: list[_Execution] = []
-        self._paused: int | None = None  #: start of the pause [ns]
+        self._paused: float | None = None  #: start of the pause in the time of the plant [s]
 
     @property
     def paused(self) -> bool:
@@ -288,8 +288,9 @@ class Executions:
         """Follow a path with some joints, at a time after its start [s]."""
         follow(path, tuple(joints), self._run, elapsed)
         self.forget(joints)
-        begun = self.sampled - round(elapsed * NANOSECONDS)
-        self._running.append(_Execution(path, frozenset(joints), begun))
+        if not path.stops:
+            begun = self._run.plant.time - elapsed
+            self._running.append(_Execution(path, frozenset(joints), begun))
 
     def forget(self, joints: Collection[str]) -> None:
         """Discard the paths of joints that something else moves."""
@@ -299,8 +300,10 @@ class Executions:
 
     def pause(self, *, withdraws: bool = False) -> None:
         """Hold the joints that move, or all if the plant withdraws; begin no motion."""
-        self._paused, end = self.sampled, self.sampled + self.period
-        self._held = [one for one in self._running if one.path.end(one.begun) > end]
+        plant = self._run.plant
+        self._paused = plant.time
+        moving = {name for name, joint in plant.references().items() if not joint.arrived}
+        self._held = [one for one in self._running if one.joints & moving]
         self._running, joints = [], self.joints_held
         # At rest nothing changes: an indenter keeps its force.
         if joints or withdraws:
@@ -308,8 +311,8 @@ class Executions:
 
     def resume(self) -> None:
         """End a pause: follow the rest of the paths that it holds."""
-        begun, held = self._paused, self._held
+        begun, held = self._paused or 0.0, self._held
         self._paused, self._held = None, []
         for one in held:
             path = one.path.only(one.joints)
-            self.follow(path, path.joints, ((begun or 0) - one.begun) / NANOSECONDS)
+            self.follow(path, path.joints, begun - one.begun)

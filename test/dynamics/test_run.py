@@ -13,6 +13,7 @@ from needle_dynamics.simulated.plant import Measurement, Plant
 from needle_dynamics.simulated.run import (
     CONFIGURED,
     Event,
+    Executions,
     PARAMETERS,
     PlantRun,
     RESET,
@@ -21,7 +22,9 @@ from needle_dynamics.simulated.run import (
     TRAJECTORY,
 )
 from needle_ros.errors import JobError
+from needle_ros.trajectories import JointPath
 import numpy as np
+from numpy.testing import assert_allclose
 import pytest
 
 #: A stamp with more digits than a float can hold to the nanosecond.
@@ -191,3 +194,36 @@ def test_stop_of_a_withdrawal_does_not_insert(
     # with another period for the end of its motion.
     assert after[0] - after[-1] <= velocity**2 + velocity * 3.0 / 300.0 + 1e-6
     assert np.ptp(after[-20:]) <= 1e-6
+
+
+@pytest.mark.requirement('S-278')
+@pytest.mark.parametrize('drift', [-300_000, 0, 300_000])
+@pytest.mark.parametrize('until', [1, 29, 30, 31])
+def test_pause_holds_what_has_not_arrived_for_any_stamps(until: int, drift: int) -> None:
+    """A path of 30 samples takes 30 samples around a pause, with stamps of another clock [ns]."""
+    run = PlantRun({'mode': 'indenter', 'rate': 200.0})
+    executions = Executions(run, ['x', 'z'])
+    count = 0
+
+    def take(samples: int) -> None:
+        nonlocal count
+        for _ in range(samples):
+            count += 1
+            executions.sampled = BEGIN + count * (5_000_000 + drift)
+            run.take(executions.sampled)
+
+    def force() -> float:
+        return run.plant.references()['z'].effort
+
+    take(10)
+    path = JointPath(['x', 'z'], [0.15], [], [], [[0.0, -1.5]])
+    executions.follow(path, ['x', 'z'], 0.0)
+    take(until)
+    executions.pause()
+    take(100)
+    # An indenter at rest keeps its force, one that moves releases it.
+    assert force() == (0.0 if until < 30 else -1.5)
+    assert executions.joints_held == ({'x', 'z'} if until < 30 else set())
+    executions.resume()
+    take(max(30 - until, 0))
+    assert_allclose(force(), -1.5, rtol=1e-12)
