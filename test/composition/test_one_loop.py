@@ -26,7 +26,8 @@ DEPTHS = step_depths(TARGET[1], 5e-3)
 
 
 def by_command(seed: int, capsys: pytest.CaptureFixture[str]) -> FloatArray:
-    words = [word for item in asdict(PRIOR).items() for word in ('--prior', '{}={}'.format(*item))]
+    values = asdict(PRIOR).items()
+    words = [word for name, value in values for word in ('--prior', f'{name}={json.dumps(value)}')]
     target = ','.join(map(str, TARGET))
     assert main(['steer', '--json', f'--target={target}', '--seed', str(seed), *words]) == 0
     return np.array(json.loads(capsys.readouterr().out)['tip [m]'])

@@ -78,11 +78,16 @@ def test_bits_do_not_depend_on_the_number_of_workers(n: int) -> None:
 
 def assert_equal(found: FloatArray, exact: FloatArray, p: NeedleParameters) -> None:
     """Compare states: to the bit, except for needles that are computed together."""
-    if p.modes > 2 or p.formulation == 'as_printed':
+    if p.formulation == 'as_printed':
         assert np.array_equal(found, exact)
         return
     # Rounding. With `tanh` it can change where a step is divided, by the error of such a part.
-    tolerance = 1e-4 if p.friction_law == 'tanh' else 1e-10
+    # With four modes a change of 1e-15 of the first state becomes 5e-7, with `tanh` 2e-4.
+    few = p.modes <= 2
+    if p.friction_law == 'tanh':
+        tolerance = 1e-4 if few else 1e-3
+    else:
+        tolerance = 1e-10 if few else 2e-5
     scale = np.abs(exact).max(axis=0) + 1e-12
     assert_allclose(found / scale, exact / scale, rtol=0.0, atol=tolerance)
 
