@@ -83,11 +83,8 @@ def assert_equal(found: FloatArray, exact: FloatArray, p: NeedleParameters) -> N
         return
     # Rounding. With `tanh` it can change where a step is divided, by the error of such a part.
     # With four modes a change of 1e-15 of the first state becomes 5e-7, with `tanh` 2e-4.
-    few = p.modes <= 2
-    if p.friction_law == 'tanh':
-        tolerance = 1e-4 if few else 1e-3
-    else:
-        tolerance = 1e-10 if few else 2e-5
+    few, several = (1e-4, 1e-3) if p.friction_law == 'tanh' else (1e-10, 2e-5)
+    tolerance = few if p.modes <= 2 else several
     scale = np.abs(exact).max(axis=0) + 1e-12
     assert_allclose(found / scale, exact / scale, rtol=0.0, atol=tolerance)
 
