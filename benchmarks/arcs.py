@@ -13,8 +13,9 @@ from typing import Final, NamedTuple
 from needle_controller.steering.insertion_plan import guide_axes
 from needle_dynamics import find_needle, FloatArray, SteeredNeedle
 from needle_dynamics.needles import NeedlePreset
+from needle_dynamics.steering.needle import inserted_shape
 from needle_planning.clearance import Clearance
-from needle_planning.paths import inserted_shape, Line
+from needle_planning.paths import Line
 from needle_planning.search import EntryRegion
 import numpy as np
 

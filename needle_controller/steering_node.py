@@ -16,7 +16,7 @@ from needle_controller.steering.law import DEFAULT_LAW, find_law, STEERING_LAWS,
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.planning import ThreadJob
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING, SteeringModel
-from needle_controller.steering.settings import ExecutiveSettings, SteeringPrior
+from needle_controller.steering.settings import ContactSettings, ExecutiveSettings, SteeringPrior
 from needle_dynamics.model_node import CompiledNode, declare_needle
 from needle_dynamics.needles import DEFAULT_NEEDLE
 from needle_dynamics.parameters import NeedleParameters
@@ -91,6 +91,7 @@ class SteeringNode(CompiledNode):
         super().__init__('steering', **node_options)
         self.declare_settings('', ExecutiveSettings())
         self.declare_settings('prior.', SteeringPrior())
+        self.declare_settings('contact.', ContactSettings())
         self.declare_text(
             'law', DEFAULT_LAW, f'steering law: one of {", ".join(STEERING_LAWS)}, or module:Class'
         )
@@ -144,7 +145,14 @@ class SteeringNode(CompiledNode):
         if plan is not None:
             needle, steering, prior = in_layers(plan.layers, needle, steering, prior)
         self._loop = SteeringExecutive(
-            needle, steering, prior, settings, start=ThreadJob, law=law, plan=plan
+            needle,
+            steering,
+            prior,
+            settings,
+            start=ThreadJob,
+            law=law,
+            plan=plan,
+            contact=self.settings('contact.', ContactSettings),
         )
         self._loop.authority = self._authority
         self._measurers = Publishers(self, contract.MEASURER, self._watch)

@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.steering.needle import SteeredNeedle
+from needle_dynamics.steering.needle import inserted_shape, SteeredNeedle
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_planning.clearance import Clearance
 from needle_ros.errors import ParameterError
@@ -175,23 +175,6 @@ def _inserted(
         shaft.append(values)
         slopes.append(turns)
     return np.concatenate(shaft), np.concatenate(slopes), np.array(loads)
-
-
-def inserted_shape(needle: SteeredNeedle, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return deflections [m] and slopes of a needle at points of the inserted part, (k, 2)."""
-    depths, deflections, slopes = needle.shape
-    # Cubic between two nodes; the exact shape deviates with the fourth power of their distance.
-    i = np.clip(np.searchsorted(depths, points, side='right') - 1, 0, len(depths) - 2)
-    h = (depths[i + 1] - depths[i])[:, np.newaxis]
-    # A tip at a node repeats its depth.
-    t = np.divide((points - depths[i])[:, np.newaxis], h, out=np.zeros_like(h), where=h > 0.0)
-    a, b, u, v = deflections[i], deflections[i + 1], h * slopes[i], h * slopes[i + 1]
-    bend, twist = 3.0 * (b - a) - 2.0 * u - v, 2.0 * (a - b) + u + v
-    values = a + t * (u + t * (bend + t * twist))
-    turns = np.divide(
-        u + t * (2.0 * bend + 3.0 * t * twist), h, out=slopes[i].copy(), where=h > 0.0
-    )
-    return values, turns
 
 
 class _Program:

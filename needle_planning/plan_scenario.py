@@ -16,6 +16,7 @@ from math import ceil, cos, hypot, pi, sin
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from needle_controller.steering.contact import monitored
 from needle_controller.steering.insertion_plan import (
     in_layers,
     MOST_LAYERS,
@@ -32,7 +33,7 @@ from needle_controller.steering.law import (
 )
 from needle_controller.steering.planned_path import PlannedPath
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.settings import SteeringLimits, SteeringPrior
+from needle_controller.steering.settings import ContactSettings, SteeringLimits, SteeringPrior
 from needle_controller.steering.simulation import (
     simulate_steering,
     SteeringPlant,
@@ -42,12 +43,12 @@ from needle_controller.steering.simulation import (
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import find_needle
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.steering.needle import SteeredNeedle
+from needle_dynamics.steering.needle import inserted_shape, SteeredNeedle
 from needle_dynamics.steering.parameters import SteeringParameters, with_layers, with_lengths
 from needle_planning.anatomy import Anatomy, Structure
 from needle_planning.certificate import least_clearances, sag_of
 from needle_planning.clearance import Clearance
-from needle_planning.paths import inserted_shape, Line
+from needle_planning.paths import Line
 from needle_ros.errors import ParameterError
 from needle_ros.settings import from_values
 from needle_study import scenario
@@ -62,7 +63,7 @@ _SEEDS: Final = 2**63  #: Upper bound of the seeds of paths.
 _SPACING: Final = 5e-3
 _TIGHT: Final = 5e-5  #: Largest difference between the bound and the true clearance [m].
 _BEYOND: Final = 0.02  #: Distance from the line within which the clearance is exact [m].
-_PARTS: Final = ('folder', 'radius', 'law', 'prior')
+_PARTS: Final = ('folder', 'radius', 'law', 'prior', 'contact')
 
 #: Variables of the layers of a plan.
 LAYERS: Final = tuple(f'layer_{k + 1}' for k in range(MOST_LAYERS))
@@ -126,7 +127,8 @@ class PlanScenario(Scenario):
     Insert needles along a plan, steered by a law, and measure tip error and clearance.
 
     `settings` holds ``folder``, written by `write_inputs`; ``radius`` of a hit [m]; ``law``, as
-    for `build_law`; ``prior``, its fields of `SteeringPrior`; and the fields of `SteeringLimits`.
+    for `build_law`; ``prior``, its fields of `SteeringPrior`; ``contact``, its fields of
+    `ContactSettings`, without which contact is not monitored; and the fields of `SteeringLimits`.
     """
 
     metrics, at_once = METRICS, 1
@@ -141,6 +143,10 @@ class PlanScenario(Scenario):
         find_law(self._law)
         prior = scenario.mapping('settings: prior', settings.get('prior'))
         self._prior = from_values(SteeringPrior, prior, 'settings.prior.')
+        contact = scenario.mapping('settings: contact', settings.get('contact'))
+        self._contact = from_values(
+            ContactSettings, {'limit': 1.0, **contact}, 'settings.contact.'
+        )
         self._folder = Path(settings['folder'])
         of_prior, bevel = self._prior, 'load of the bevel beyond the nominal one'
         self.variables: Mapping[str, Variable] = {
@@ -232,6 +238,7 @@ class PlanScenario(Scenario):
         sensor = SteppedTipSensor(plant, row['tip_noise'], errors, seed, rng, rng)
         limits, path = replace(self._limits, turns=0), inputs.path
         law = build_law(self._law, inputs.model, path.tips[-1], limits, inputs.plan.roll, path)
+        law = monitored(law, inputs.model, inputs.plan, path, limits, self._contact)
         stopped = False
         try:
             simulate_steering(law, plant, sensor)

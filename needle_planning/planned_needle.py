@@ -10,8 +10,8 @@ from typing import Final
 from needle_controller.steering.insertion_plan import in_layers, Plan
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import find_needle
-from needle_dynamics.steering.needle import SteeredNeedle
-from needle_planning.paths import inserted_shape, Line
+from needle_dynamics.steering.needle import inserted_shape, SteeredNeedle
+from needle_planning.paths import Line
 from needle_ros.errors import ParameterError
 import numpy as np
 

@@ -14,7 +14,7 @@ from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle, NeedlePreset
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_planning.anatomy import Anatomy
-from needle_planning.certificate import simulate_insertion, SimulatedInsertion
+from needle_planning.certificate import free_space, simulate_insertion, SimulatedInsertion
 from needle_planning.clearance import Clearance, image_frame
 from needle_planning.layers import tissue_layers
 from needle_planning.paths import (
@@ -242,6 +242,7 @@ class _Planner:
             straight_bound=lines.bound,
             bound=bound,
             layers=self._layers(line),
+            free=free_space(self.clearance, line, depths, found.path),
         )
 
     @property

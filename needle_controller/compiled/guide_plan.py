@@ -30,7 +30,7 @@ import numpy as np
 if TYPE_CHECKING:
     from needle_dynamics.compiled.boxed import Boxed
 
-_USED: Final = 0.8  #: Fraction of the later guide motion that the plan uses.
+USED: Final = 0.8  #: Fraction of the later guide motion that the plan uses.
 
 #: Candidate positions of the guide, relative to its range.
 _FINE: Final = np.linspace(-1.0, 1.0, 121)
@@ -80,7 +80,7 @@ def _ends(c: Steering, w: FloatArray, turns: int, first: int) -> FinalTip:
             g, load = i % len(r.bevel), constant_mean(c, i, BEVEL)
             for j in range(first, last + 1):
                 means[i] -= load * r.bevel[g, last, j] * c.turned[g, j]
-            turned[i] = _USED * sqrt(0.5) * abs(load) * r.later_bevel[g, first]
+            turned[i] = USED * sqrt(0.5) * abs(load) * r.later_bevel[g, first]
     errors = np.empty(len(means))
     for i in range(len(means)):
         errors[i] = sqrt(tip.variances[i])
@@ -257,12 +257,12 @@ def _costs(c: Steering, w: FloatArray, ends: FinalTip, candidates: FloatArray) -
             shift, anywhere = r.guide[g, last, k], c.limit * r.later_guide[g, k + 1 + near]
             for t in range(count):
                 left[t] = need - shift * to[t]
-                later[t] = _USED * anywhere + ends.turned[i]
+                later[t] = USED * anywhere + ends.turned[i]
             for j in range(near):
                 shift = r.guide[g, last, k + 1 + j]
                 for t in range(count):
                     left[t] -= shift * middles[j, t]
-                    later[t] += _USED * abs(shift) * halves[j, t]
+                    later[t] += USED * abs(shift) * halves[j, t]
             for a in range(len(_WEIGHTS)):
                 off, weight = ends.errors[i] * _ABSCISSAS[a], w[i] * _WEIGHTS[a]
                 for t in range(count):

@@ -20,12 +20,17 @@ from needle_controller.steering.insertion import SteppedInsertion
 from needle_controller.steering.insertion_plan import Plan
 from needle_controller.steering.insertion_record import PlannedInsertion, RecordKeeper
 from needle_controller.steering.insertion_status import describe, summarize
-from needle_controller.steering.law import DEFAULT_LAW, SteeringLaw, TipEstimate
+from needle_controller.steering.law import ContactError, DEFAULT_LAW, SteeringLaw, TipEstimate
 from needle_controller.steering.motion import JointMotion
 from needle_controller.steering.motion_control import MotionControl, Retraction
 from needle_controller.steering.planner import check_plan, describe_target, InsertionPlanner
 from needle_controller.steering.planning import Job, StartJob
-from needle_controller.steering.settings import ExecutiveSettings, SteeringPrior
+from needle_controller.steering.settings import (
+    ContactSettings,
+    ExecutiveSettings,
+    SteeringPrior,
+    WITHDRAW,
+)
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
@@ -74,6 +79,8 @@ class SteeringExecutive(StateMachine[JointMotion]):
         Steering law, see `build_law`.
     plan : Plan, optional
         Plan that all insertions follow.
+    contact : ContactSettings, optional
+        Monitoring of the clearance along the plan.
 
     Raises
     ------
@@ -91,6 +98,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         start: StartJob = Job,
         law: str = DEFAULT_LAW,
         plan: Plan | None = None,
+        contact: ContactSettings | None = None,
     ) -> None:
         super().__init__(steady, {TARGET: (INSERTION,)})
         self.settings = settings
@@ -101,7 +109,10 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self.fault, self._noise = '', prior.noise
         if plan is not None:
             check_plan(plan, settings)
-        self.planner = InsertionPlanner(needle, steering, prior, settings, start, law, plan)
+        self._contact = contact or ContactSettings()
+        self.planner = InsertionPlanner(
+            needle, steering, prior, settings, start, law, plan, self._contact
+        )
         self._motions = MotionControl(settings, self.events)
         self.keeper = RecordKeeper()  #: record of the insertion, for an executive after a restart
         self._tip: tuple[float, ...] | None = None  #: the newest reading of the tip [m]
@@ -350,6 +361,13 @@ class SteeringExecutive(StateMachine[JointMotion]):
             return None
         try:
             move = process(insertion)
+        except ContactError as error:
+            if self._contact.action != WITHDRAW:
+                return self._stop(str(error), now)
+            self.events.add(Severity.ERROR, f'{error}; the needle is withdrawn')
+            self.authority.request(RETRACT)
+            move, self.fault = self.obey(now), str(error)
+            return move
         except NeedleError as error:
             return self._stop(str(error), now)
         if insertion.phase is Phase.DONE:

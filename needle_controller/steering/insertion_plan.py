@@ -20,6 +20,7 @@ from needle_ros.settings import is_number
 import numpy as np
 import yaml
 
+DIRECTIONS: Final = 16  #: Number of directions of the free space about a path.
 MOST_LAYERS: Final = 8  #: Most layers of tissue along a line.
 _FORMAT: Final = 1  #: Version of the file.
 #: Constants of `SteeringParameters` with one value for each layer.
@@ -55,6 +56,9 @@ class Plan(Displayed):
     #: Depth at which each layer of tissue begins [m], median stiffness [N/m^2], and standard
     #: deviation of its logarithm, shape (layers, 3); without rows, the tissue of the needle file.
     layers: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    #: Free space around the path: depth of each place, and free distance from the path in 16
+    #: directions from x to z [m], shape (places, 17); without rows, it is not known.
+    free: FloatArray = field(default_factory=lambda: np.zeros((0, 1 + DIRECTIONS)))
 
     @property
     def length(self) -> float:
@@ -159,6 +163,8 @@ def read_plan(path: Path | str) -> Plan:
         value = document.get(item.name)
         if item.name == 'layers':
             value = _layers(f'{path}: layers', value)
+        elif item.name == 'free':
+            value = _free(f'{path}: free', value)
         elif item.name in shapes:
             value = _array(f'{path}: {item.name}', value, shapes[item.name])
         elif item.name in ('needle', 'structure'):
@@ -191,6 +197,15 @@ def _layers(name: str, value: object) -> FloatArray:
             f'{name} must be at most {MOST_LAYERS}, each with a stiffness > 0 N/m^2 and a spread '
             '>= 0'
         )
+    return found
+
+
+def _free(name: str, value: object) -> FloatArray:
+    if not value:
+        return np.zeros((0, 1 + DIRECTIONS))
+    found = _array(name, value, (_length_of(value), 1 + DIRECTIONS))
+    if (np.diff(found[:, 0]) <= 0.0).any() or (found < 0.0).any():
+        raise ParameterError(f'{name} must be at increasing depths, with distances >= 0 m')
     return found
 
 

@@ -37,6 +37,10 @@ class SteeringFaultError(JobError):
     """The tip measurement is implausible, frozen or missing, or the law has failed."""
 
 
+class ContactError(SteeringFaultError):
+    """The probability of contact along a plan is above its limit."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TipEstimate:
     """Estimated or predicted position of the tip."""
@@ -53,6 +57,16 @@ class TipEstimate:
         """Return whether the 95 % ellipse contains a position x, z [m], shape (2,)."""
         off = tip - self.mean
         return bool(off @ np.linalg.solve(self.covariance, off) <= _CHI_SQUARED)
+
+
+class Forecast(NamedTuple):
+    """Forecast of the tip from the depth of the last measurement on, over r depths of n + 1."""
+
+    means: FloatArray  #: expected tip with the guide below, x and z [m], shape (r, 2)
+    covariances: FloatArray  #: its covariances [m^2], shape (r, 2, 2)
+    #: Expected shift of the tip at each depth per shift of the guide in each step, (n + 1, n).
+    response: FloatArray
+    guide: FloatArray  #: guide in each step, past and planned [m], shape (n, 2)
 
 
 class GuideSetpoint(NamedTuple):

@@ -2,7 +2,7 @@
 """Planner of an insertion: check its start, and compute the steering law in a job."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import ceil
 from typing import Final
 
@@ -12,7 +12,7 @@ from needle_controller.steering.insertion_record import PlannedInsertion, Steeri
 from needle_controller.steering.law import build_law, SteeringLaw
 from needle_controller.steering.planning import Job, Progress, StartJob
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.settings import ExecutiveSettings, SteeringPrior
+from needle_controller.steering.settings import ContactSettings, ExecutiveSettings, SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
@@ -35,6 +35,7 @@ class InsertionPlanner:
     start_job: StartJob
     law: str
     plan: Plan | None = None
+    contact: ContactSettings = field(default_factory=ContactSettings)
     job: Job[SteeringLaw] | None = None  #: computation under way
     request: PlannedInsertion | None = None  #: its request
     recalled: SteeringRecord | None = None  #: record of the insertion before a restart
@@ -128,9 +129,9 @@ class InsertionPlanner:
         x, _, z = request.point if record is None else record.point
         at = request.at if record is None else record.start
         limits = settings.limits(float(request.point[1] - depths[0]) / (len(depths) - 1))
-        roll, path = float(at[3]) if settings.turns else 0.0, None
-        if self.plan is not None:
-            roll, path = self.plan.roll, self.plan.tip_path.since(float(depths[0]))
+        roll, path, plan = float(at[3]) if settings.turns else 0.0, None, self.plan
+        if plan is not None:
+            roll, path = plan.roll, plan.tip_path.since(float(depths[0]))
 
         def work(progress: Progress) -> SteeringLaw:
             model = SteeringModel(
@@ -141,7 +142,12 @@ class InsertionPlanner:
                 together=settings.continuous,
                 progress=progress,
             )
-            return build_law(self.law, model, (x, z), limits, roll, path)
+            law = build_law(self.law, model, (x, z), limits, roll, path)
+            if plan is None or path is None:
+                return law
+            from needle_controller.steering.contact import monitored
+
+            return monitored(law, model, plan, path, limits, self.contact)
 
         self.request, self.job = request, self.start_job(work)
 

@@ -9,7 +9,14 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.contract import GUIDE_X, GUIDE_Z, INSERTION, ROLL
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_constants, CheckedSettings, constant, flag, same_field
+from needle_ros.settings import (
+    check_constants,
+    CheckedSettings,
+    choice,
+    constant,
+    flag,
+    same_field,
+)
 from needle_ros.system_state import RETRACT_DEPTH
 import numpy as np
 
@@ -89,6 +96,26 @@ class SteeringPrior(CheckedSettings):
         5e-4, 'm', 'standard deviation of a slow error of the tip sensor; 0, one and three times '
         'as much is considered',
     )  # fmt: skip
+
+
+#: What happens before contact along a plan.
+STOP_HERE, WITHDRAW, REPLAN = CONTACT_ACTIONS = 'stop', 'retract', 'replan'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContactSettings(CheckedSettings):
+    """Monitoring of the clearance along a plan."""
+
+    limit: float = constant(
+        0.2,
+        '1',
+        'largest probability of contact along a plan before each motion; 1: not monitored',
+        high=1.0,
+    )
+    action: str = choice(STOP_HERE, CONTACT_ACTIONS, 'what happens above the limit')
+    registration: float = constant(
+        5e-4, 'm', 'standard deviation of the anatomy from the frame of the plan along each axis'
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

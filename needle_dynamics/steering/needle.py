@@ -353,6 +353,23 @@ class SteeredNeedle(Displayed):
         return self._solve()[2].T
 
 
+def inserted_shape(needle: SteeredNeedle, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return deflections [m] and slopes of a needle at points of the inserted part, (k, 2)."""
+    depths, deflections, slopes = needle.shape
+    # Cubic between two nodes; the exact shape deviates with the fourth power of their distance.
+    i = np.clip(np.searchsorted(depths, points, side='right') - 1, 0, len(depths) - 2)
+    h = (depths[i + 1] - depths[i])[:, np.newaxis]
+    # A tip at a node repeats its depth.
+    t = np.divide((points - depths[i])[:, np.newaxis], h, out=np.zeros_like(h), where=h > 0.0)
+    a, b, u, v = deflections[i], deflections[i + 1], h * slopes[i], h * slopes[i + 1]
+    bend, twist = 3.0 * (b - a) - 2.0 * u - v, 2.0 * (a - b) + u + v
+    values = a + t * (u + t * (bend + t * twist))
+    turns = np.divide(
+        u + t * (2.0 * bend + 3.0 * t * twist), h, out=slopes[i].copy(), where=h > 0.0
+    )
+    return values, turns
+
+
 def _finite(name: str, value: Any) -> float:
     if not is_number(value):
         raise ParameterError(f'{name} must be a finite number, got {value!r}')

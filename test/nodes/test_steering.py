@@ -610,6 +610,32 @@ def test_insertion_along_a_plan(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert off[-1] < 5e-4
 
 
+@pytest.mark.requirement('S-315')
+@pytest.mark.parametrize('action', ['stop', 'retract'])
+def test_needle_stops_before_contact_along_a_plan(
+    ros_graph: RosGraph, tmp_path: Path, action: str
+) -> None:
+    """At a wall across the path from 30 mm on, with the reason; a withdrawn needle leaves."""
+    plan, file = bowed_plan(), tmp_path / 'plan.yaml'
+    free = plan.free.copy()
+    free[free[:, 0] >= 0.03, 1:] = 0.0
+    write_plan(replace(plan, free=free), file)
+    bench = Bench(ros_graph, plan=str(file), guide_step=3e-3, **{'contact.action': action})
+    truth = ros_graph.listen(bench.user, JointState, 'ground_truth', SENSOR)
+    x, z = plan.tip_path.tips[-1].tolist()
+    bench.aim((x, plan.length, z))
+
+    end = SteeringPhase.STOPPED if action == 'stop' else SteeringPhase.IDLE
+    bench.until(lambda: bench.status.fault and bench.status.phase is end, 'the end')
+    assert 'contact at a depth of' in bench.status.fault
+    length = NEEDLES[plan.needle].needle.length
+    depths = [length - one.position[one.name.index('d')] for one in truth]
+    assert max(depths) < 0.03
+    if action == 'retract':
+        # `retract_depth`
+        assert depths[-1] == pytest.approx(5e-3, abs=1e-3)
+
+
 @pytest.mark.parametrize(
     ('change', 'message'),
     [

@@ -7,13 +7,13 @@ from needle_controller.steering.insertion_plan import guide_axes
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics import find_needle, FloatArray, NEEDLES, SteeredNeedle
 from needle_dynamics.needles import NeedlePreset
+from needle_dynamics.steering.needle import inserted_shape
 from needle_planning.anatomy import Anatomy, Structure
 from needle_planning.certificate import simulate_insertion
 from needle_planning.clearance import Clearance
 from needle_planning.paths import (
     best_bow,
     bow_profile,
-    inserted_shape,
     Line,
     needle_radius,
     path_responses,

@@ -8,11 +8,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from needle_controller.steering.free_space import UNITS
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics import find_needle, FloatArray, SteeredNeedle
+from needle_dynamics.steering.needle import inserted_shape
 from needle_planning import find_plan, NoPathError, Plan, read_plan, write_plan
 from needle_planning.anatomy import Anatomy, Structure
-from needle_planning.paths import inserted_shape, Line, needle_radius
+from needle_planning.clearance import Clearance
+from needle_planning.paths import Line, needle_radius
 from needle_planning.search import disc_region, voxel_region
 from needle_ros.errors import NeedleError, ParameterError
 import numpy as np
@@ -460,6 +463,35 @@ def test_plan_file_is_the_plan(tmp_path: Path) -> None:
     assert list(plan.to_dataframe()) == list(plan.columns())
 
 
+@pytest.mark.parametrize('shift', [0, 2])
+def test_free_space_is_free_to_its_edge(shift: int) -> None:
+    """In every direction: clear before the edge, and not clear just beyond it, by brute force."""
+    anatomy = window(1.3e-3, shift)
+    plan = find_plan(anatomy, TARGET, entry=(0.028, 0.038, 0.117))
+    clearance = Clearance(
+        [anatomy], np.vstack([plan.entry, plan.path]), radius=plan.radius, beyond=0.02
+    )
+    depths, free, path, axes = plan.free[:, 0], plan.free[:, 1:], plan.tip_path, plan.axes
+    assert depths[0] < 2e-3 < plan.length - 2e-3 < depths[-1] < plan.length
+    assert free.min() >= plan.clearance - 1e-4
+    # Samples of each place, 0.1 mm apart, on the path.
+    along = depths[:, np.newaxis] + np.linspace(-9.5e-4, 9.5e-4, 20)
+    middle = [np.interp(along, path.depths, one) for one in path.tips.T]
+
+    def clearances(distance: FloatArray) -> FloatArray:
+        """Return the least clearance of each place in each direction at a distance (m, 16)."""
+        x = middle[0][..., np.newaxis] + (distance * UNITS[:, 0])[:, np.newaxis]
+        z = middle[1][..., np.newaxis] + (distance * UNITS[:, 1])[:, np.newaxis]
+        points = np.stack([x, np.broadcast_to(along[..., np.newaxis], x.shape), z], axis=-1)
+        found = clearance.at(plan.entry + points.reshape(-1, 3) @ axes)
+        return np.asarray(found.reshape(x.shape).min(axis=1))
+
+    for part in (0.2, 0.5, 0.8, 0.99):
+        assert (clearances(part * free) >= 0.0).all()
+    # One sample limits the distance, to 10 um and the rounding of its depth.
+    assert clearances(free)[free < 0.01].max() < 2e-5
+
+
 @pytest.mark.parametrize(
     ('old', 'new', 'message'),
     [
@@ -473,6 +505,8 @@ def test_plan_file_is_the_plan(tmp_path: Path) -> None:
         ('guide:', 'guides:', 'must have .* finite numbers'),
         ('depths: [0.0', 'depths: [1.0', 'depths must increase from 0 m'),
         ('frame:', '\tframe:', 'cannot be read: is not YAML'),
+        ('free:', 'free: [[0.1, 1.0]]\nspace:', 'free must have 1 x 17 finite numbers'),
+        ('free:', f'free: [{[0.1] + [-1.0] * 16}]\nspace:', 'free must be at increasing depths'),
     ],
 )
 def test_damaged_plan_is_rejected_by_a_line(

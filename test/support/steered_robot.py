@@ -12,6 +12,7 @@ from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrio
 from needle_controller.steering.insertion_plan import Plan
 from needle_controller.steering.law import DEFAULT_LAW
 from needle_controller.steering.motion import JointMotion
+from needle_controller.steering.settings import ContactSettings
 from needle_dynamics import NEEDLES, SteeredNeedle
 from needle_ros.contract import JOINT_TRAJECTORY
 from needle_ros.requests import RequestLog, Verdict
@@ -38,6 +39,7 @@ class Robot:
         prior: SteeringPrior | None = None,
         law: str = DEFAULT_LAW,
         plan: Plan | None = None,
+        contact: ContactSettings | None = None,
     ) -> None:
         self.seconds = 0.0
         self.loop = SteeringExecutive(
@@ -48,6 +50,7 @@ class Robot:
             steady=lambda: self.seconds,
             law=law,
             plan=plan,
+            contact=contact,
         )
         softer = replace(NEEDLE, tissue_stiffness=0.6 * NEEDLE.tissue_stiffness)
         self.needle = SteeredNeedle(softer, STEERING, tilt=(0.01, 0.02))

@@ -43,6 +43,7 @@ from needle_controller.steering.law import (
     checked_roll,
     checked_target,
     checked_tip,
+    Forecast,
     GuideSetpoint,
     SteeringFaultError,
     SteeringLaw,
@@ -167,9 +168,7 @@ class MultiHypothesisLaw(SteeringLaw):
     def follow(self, path: PlannedPath) -> None:
         """Follow a planned path with the depths of the model, before the first measurement."""
         now, tips = self._now, self._model.steps + 1
-        waypoints, planned = (
-            np.array(one @ (1.0, 1.0j), dtype=np.complex128) for one in (path.tips, path.guide)
-        )
+        waypoints, planned = _complex(path.tips), _complex(path.guide)
         if (len(waypoints), len(planned)) != (tips, tips - 1):
             raise ShapeError(f'a path must have the {tips - 1} steps of the model')
         # In every hypothesis the planned guide leads along the path, until a measurement deviates.
@@ -178,6 +177,13 @@ class MultiHypothesisLaw(SteeringLaw):
         load = now.mean[:, tips + hypotheses.BEVEL, np.newaxis]
         now.mean[:, :tips] = waypoints - (r.guide @ planned)[point] - load * bevel
         self._use(now._replace(waypoints=waypoints, planned=planned, following=guide_plan.PATH))
+        self._hit_probability = None
+
+    def redirect(self, path: PlannedPath) -> None:
+        """Follow another path from the present depth on, with the guide of the planned step."""
+        now, planned = self._now, _complex(path.guide)
+        now.guide[self.step - 1] = planned[self.step - 1]
+        self._use(now._replace(waypoints=_complex(path.tips), planned=planned))
         self._hit_probability = None
 
     # Estimates.
@@ -233,6 +239,28 @@ class MultiHypothesisLaw(SteeringLaw):
         self._check_depth(number, self._model.steps)
         x, z, xx, xz, zz = hypotheses.predict(self._boxed, number)
         return TipEstimate(np.array([x, z]), np.array([[xx, xz], [xz, zz]]))
+
+    def forecast(self) -> Forecast:
+        """Predict the tip from the last measured depth on, and how the guide moves it."""
+        now, steps, w = self._now, self._model.steps, self.weights
+        r, first = self._model.responses, max(0, self.step - 1)
+        tips = [self.expected(at) for at in range(first, steps + 1)]
+        points, constants = len(r.guide), now.mean[:, steps + 1 :].real
+        # Hypothesis i has the responses of the point i modulo the number of points.
+        by_point = w.reshape(-1, points).sum(axis=0)
+        response = np.einsum('g,gkj->kj', by_point, r.guide)
+        for k, between in enumerate(r.between):
+            mean = (w * constants[:, k + 1]).reshape(-1, points).sum(axis=0)
+            response += np.einsum('g,gkj->kj', mean, between)
+        # As `hypotheses.guide_ahead`, which compiled functions only can call.
+        done, guide = min(self.step, steps), now.guide.copy()
+        guide[done:] = now.planned[done:] + (guide - now.planned)[max(done - 1, 0)]
+        return Forecast(
+            means=np.array([one.mean for one in tips]),
+            covariances=np.array([one.covariance for one in tips]),
+            response=response,
+            guide=np.column_stack([guide.real, guide.imag]),
+        )
 
     @property
     def hit_probability(self) -> float:
@@ -328,3 +356,7 @@ class MultiHypothesisLaw(SteeringLaw):
 
     def _choose(self) -> complex:
         return guide_plan.choose_guide(self._boxed)
+
+
+def _complex(points: FloatArray) -> ComplexArray:
+    return np.array(points @ (1.0, 1.0j), dtype=np.complex128)
