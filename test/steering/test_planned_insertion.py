@@ -8,7 +8,6 @@ from typing import Any
 
 from needle_controller import SteeringPrior
 from needle_controller.steering.insertion_plan import Plan
-from needle_controller.steering.settings import ContactSettings
 from needle_ros.errors import ParameterError
 from needle_ros.status import SteeringPhase as Phase
 import numpy as np
@@ -32,9 +31,7 @@ def deviation(robot: Robot, tips: dict[float, Any], plan: Plan = PLAN) -> float:
 @pytest.mark.parametrize('start', [0.0, 0.003])
 def test_tip_stays_in_its_tube_and_reaches_the_target(start: float) -> None:
     """A needle in softer tissue with a tilted guide, from the skin or inserted straight before."""
-    # The tube is around the tip; the guide moves the needle behind it.
-    alone = ContactSettings(limit=1.0)
-    robot = Robot(plan=PLAN, prior=SteeringPrior(noise=5e-5), contact=alone)
+    robot = Robot(plan=PLAN, prior=SteeringPrior(noise=5e-5))
     robot.ways[0] = np.zeros(1), np.full(1, start)
     robot.tick(20)
     x, z = PLAN.tip_path.tips[-1].tolist()

@@ -8,7 +8,7 @@ from needle_dynamics import FloatArray, NEEDLES, SteeredNeedle
 import numpy as np
 
 NEEDLE, STEERING, _ = NEEDLES['bending_35mm']
-_SKIN = 0.02  #: Depth from which on the tube is around the needle, too [m].
+SPACE = 5e-3  #: Free distance of the needle, which the guide moves more than the tip [m].
 _PLACE = 2e-3  #: Distance of the places of free space [m].
 CLEARANCE = 1.5e-3  #: Radius of the free tube around the path [m].
 
@@ -24,9 +24,6 @@ def bowed_plan(length: float = 0.06, steps: int = 12, bow: float = 3e-3) -> Plan
         needle.move(guide=setpoint.tolist())
         needle.move(depth=depth)
         tips.append(needle.tip)
-    free = tube(length, CLEARANCE)
-    # The guide moves the needle near the skin.
-    free[free[:, 0] < _SKIN, 1:] = 0.01
     entry, direction = np.array([0.1, 0.02, 0.03]), np.array([-1.0, 0.0, 0.0])
     path = entry + np.array(tips) @ guide_axes(direction)
     return Plan(
@@ -34,7 +31,7 @@ def bowed_plan(length: float = 0.06, steps: int = 12, bow: float = 3e-3) -> Plan
         roll=0.0, depths=depths, guide=guide, path=path, clearances=np.full(steps + 1, CLEARANCE),
         clearance=CLEARANCE, structure='tube', place=path[steps // 2],
         bow=float(np.abs(np.array(tips)[:, 0]).max()), resolution=5e-4, straight_bound=0.0,
-        bound=CLEARANCE, free=free,
+        bound=CLEARANCE, free=tube(length, SPACE),
     )  # fmt: skip
 
 
