@@ -201,18 +201,47 @@ def read_anatomy(
     if not paths:
         raise ParameterError('at least one segmentation is needed')
     meaning = read_labels(labels)
+    grid = meaning.grid
+    layers = (
+        (str(path), layer)
+        for path in paths
+        for layer in read_layers(path, grid.space, grid.spacing)
+    )
+    return anatomy_of(layers, meaning, labels)
+
+
+def anatomy_of(
+    layers: Iterable[tuple[str, Layer]], meaning: Labels, labels: Path | str
+) -> tuple[Anatomy, ...]:
+    """
+    Build one anatomy for each grid of layers, as `read_anatomy`.
+
+    Parameters
+    ----------
+    layers : iterable of tuple
+        Name of the source of each layer for messages, and the layer.
+    meaning : Labels
+        Roles of the labels.
+    labels : Path or str
+        File of the roles, for messages.
+
+    Returns
+    -------
+    tuple of Anatomy
+        Anatomies with disjoint grids; SegmentationError or ParameterError as of `read_anatomy`.
+
+    """
     grids: list[_Painted] = []
     found: Counter[int | str] = Counter()
     names: set[str] = set()
-    for path in paths:
-        for layer in read_layers(path, meaning.grid.space, meaning.grid.spacing):
-            names |= set(layer.names.values())
-            table, used = _numbers(path, layer, meaning)
-            found.update(used)
-            same = [one for one in grids if one.has_grid_of(layer)]
-            if not same:
-                grids.append(_Painted.empty(layer, sum(one.labels.size for one in grids)))
-            (same or grids[-1:])[0].paint(layer, table)
+    for source, layer in layers:
+        names |= set(layer.names.values())
+        table, used = _numbers(source, layer, meaning)
+        found.update(used)
+        same = [one for one in grids if one.has_grid_of(layer)]
+        if not same:
+            grids.append(_Painted.empty(layer, sum(one.labels.size for one in grids)))
+        (same or grids[-1:])[0].paint(layer, table)
     for key in meaning.numbers:
         if not found[key]:
             raise ParameterError(
@@ -241,7 +270,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _numbers(
-    path: Path, layer: Layer, labels: Labels
+    source: str, layer: Layer, labels: Labels
 ) -> tuple[NDArray[np.uint8], list[int | str]]:
     """Return the number of the structure of each value, and the keys that are in a layer."""
     table = np.zeros(LARGEST_VALUE + 1, np.uint8)
@@ -251,14 +280,14 @@ def _numbers(
         keys = [key for key in (value, name) if key in labels.numbers]
         if len(keys) > 1:
             raise ParameterError(
-                f'{path}: label {value} has two roles in structures, as {value} and as {name!r}'
+                f'{source}: label {value} has two roles in structures, as {value} and as {name!r}'
             )
         used += keys
         table[value] = labels.numbers[keys[0]] if keys else labels.others
         without += [name] if not table[value] else []
     if without:
         raise ParameterError(
-            f'{path}: labels without a role: {_listed(without)}; add them to structures, or '
+            f'{source}: labels without a role: {_listed(without)}; add them to structures, or '
             'others: {role: tissue} for all of them'
         )
     return table, used

@@ -17,7 +17,16 @@ import zlib
 from needle_dynamics import FloatArray
 from needle_planning.anatomy import SegmentationError
 from needle_planning.surfaces import read_surfaces
-from needle_planning.voxels import check_size, Layer, present, read_values, to_ras, turned, Values
+from needle_planning.voxels import (
+    check_size,
+    Layer,
+    present,
+    read_values,
+    to_ras,
+    turned,
+    value_names,
+    Values,
+)
 from needle_ros.errors import missing_extra
 import numpy as np
 
@@ -132,7 +141,7 @@ def _layers(path: Path, space: str, spacing: float) -> Iterator[Layer]:
         raise SegmentationError('has no labeled voxel')
     single = sum(map(len, found)) == 1
     for number, (layer, labels) in enumerate(zip(values, found, strict=True)):
-        names = {value: stem if single else f'{stem}:{value}' for value in labels}
+        names = value_names(stem, labels, alone=single)
         names |= {
             one.value: one.name for one in segments if one.layer == number and one.value in names
         }

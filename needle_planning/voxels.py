@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import permutations
 from math import prod
-from typing import BinaryIO, Final, NamedTuple, TypeAlias, TypeVar
+from typing import Final, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from needle_dynamics import FloatArray
 from needle_planning.anatomy import check_axes, SegmentationError
@@ -27,6 +27,14 @@ SPACES: Final[Mapping[str, tuple[float, float, float]]] = {
     'RAS': (1.0, 1.0, 1.0),
     'LPS': (-1.0, -1.0, 1.0),
 }
+
+
+class Readable(Protocol):
+    """Source of bytes: a file, or a message."""
+
+    def read(self, size: int, /) -> bytes | memoryview:
+        """Return the next bytes, fewer at the end."""
+        ...
 
 
 class Layer(NamedTuple):
@@ -60,7 +68,7 @@ def check_size(shape: tuple[int, ...]) -> None:
 
 @np.errstate(all='ignore')
 def read_values(
-    stream: BinaryIO, shape: tuple[int, ...], dtype: np.dtype, slope: float, intercept: float
+    stream: Readable, shape: tuple[int, ...], dtype: np.dtype, slope: float, intercept: float
 ) -> Values:
     """Read the values of all voxels, the first index fastest; they must be whole numbers."""
     check_size(shape)
@@ -96,6 +104,11 @@ def present(values: Values) -> list[int]:
     for plane in planes(values):
         seen[plane] = True
     return [int(value) for value in np.flatnonzero(seen) if value]
+
+
+def value_names(name: str, values: list[int], *, alone: bool) -> dict[int, str]:
+    """Return the name of each value: of the file if it is alone there, else of both."""
+    return {value: name if alone else f'{name}:{value}' for value in values}
 
 
 def planes(values: Values, like: Values | None = None) -> Values:

@@ -303,6 +303,7 @@ class SlicerStatus(NodeStatus):
     targets: int = entry(0, '', 'published targets')
     rejected: int = entry(0, '', 'rejected messages')
     last_rejection: str = entry('', '', 'reason of the last rejection')
+    planning: str = entry('', '', 'state of the plan for a target, empty without labels')
 
 
 #: All status classes of nodes by kind, in the order above.

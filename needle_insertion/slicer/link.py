@@ -30,7 +30,7 @@ HEADER: Final = struct.Struct('>H12s20sIIQQ')
 #: Versions of the header: 1 and 2 of OpenIGTLink 1 to 3, and a future version.
 _VERSIONS: Final = (1, 2, 3)
 
-LARGEST: Final = 1 << 16  #: largest accepted body [bytes]: 481 points
+LARGEST: Final = 1 << 16  #: largest accepted body of a target [bytes]: 481 points
 
 #: Largest skipped body [bytes]; a larger size is a protocol error.
 _LARGEST_SKIPPED: Final = 1 << 30
@@ -42,6 +42,9 @@ _PATIENCE: Final = 5.0  #: timeout of a peer that accepts no byte [s]
 _AT_ONCE: Final = 1 << 14
 _MOST_READ: Final = 1 << 18
 _MOST_WAITING: Final = 1 << 18
+
+#: Longest time in a call of `poll` for the bytes of a large message [s].
+_LONGEST_READ: Final = 5e-3
 
 #: Buffers of the system; small, because data in them becomes outdated [bytes].
 _SYSTEM_BUFFER: Final = 1 << 16
@@ -55,42 +58,68 @@ class Frame(NamedTuple):
 
     kind: str
     device: str
-    data: bytes
+    data: bytes | bytearray
 
 
 class Frames:
-    """Splitter of a byte stream into wanted messages; `refuse` reports too large ones."""
+    """
+    Splitter of a byte stream into messages; `refuse` reports too large ones.
+
+    `largest` returns the largest accepted body of a type and a device [bytes], 0 to skip it.
+    """
 
     def __init__(
-        self, wanted: Callable[[str, str], bool], refuse: Callable[[str], object]
+        self, largest: Callable[[str, str], int], refuse: Callable[[str], object]
     ) -> None:
-        self._wanted, self._refuse = wanted, refuse
-        self._rest = b''
+        self._largest, self._refuse = largest, refuse
+        self._rest = bytearray()
         self._skip = 0
+        #: Size with which the next message is complete, and its type and device.
+        self._whole, self._next = 0, ''
+
+    @property
+    def incomplete(self) -> str:
+        """State of a message that is larger than a target and incomplete, empty without one."""
+        if self._whole <= HEADER.size + LARGEST:
+            return ''
+        return f'{self._next} has {len(self._rest)} of {self._whole} bytes'
 
     def take(self, data: bytes) -> list[Frame]:
         """Return the messages completed by further bytes; `MessageError` if not OpenIGTLink."""
-        stream, at, found = self._rest + data, 0, []
+        self._rest += data
+        stream, at, found = self._rest, 0, []
+        if len(stream) < self._whole:
+            return []
+        self._whole = 0
         while True:
             step = min(self._skip, len(stream) - at)
             at, self._skip = at + step, self._skip - step
             if self._skip or len(stream) - at < HEADER.size:
                 break
-            kind, device, size = _header(stream[at : at + HEADER.size])
-            whole = HEADER.size + size
-            if not self._wanted(kind, device):
+            kind, device, size = _header(bytes(stream[at : at + HEADER.size]))
+            whole, largest = HEADER.size + size, self._largest(kind, device)
+            if not largest:
                 self._skip = whole
-            elif size > LARGEST:
+            elif size > largest:
+                what = 'target' if largest == LARGEST else 'segmentation'
                 self._refuse(
-                    f'target refused: a {kind} message of {size} bytes, {LARGEST} at most'
+                    f'{what} refused: a {kind} message of {size} bytes, {largest} at most'
                 )
                 self._skip = whole
             elif len(stream) - at < whole:
+                self._whole, self._next = whole, f'{kind} {device}'
                 break
+            elif size > LARGEST:
+                # Not copied.
+                del stream[:at]
+                message, stream, at = stream, stream[whole:], 0
+                del message[whole:]
+                found.append(Frame(kind, device, message))
             else:
-                found.append(Frame(kind, device, stream[at : at + whole]))
+                found.append(Frame(kind, device, bytes(stream[at : at + whole])))
                 at += whole
-        self._rest = stream[at:]
+        del stream[:at]
+        self._rest = stream
         return found
 
 
@@ -135,12 +164,12 @@ class LinkSettings:
 
 
 class Connection:
-    """Connection to a peer, which is restored whenever it is lost; `wanted` as in `Frames`."""
+    """Connection to a peer, which is restored whenever it is lost; `largest` as in `Frames`."""
 
     def __init__(
         self,
         settings: LinkSettings,
-        wanted: Callable[[str, str], bool],
+        largest: Callable[[str, str], int],
         events: EventLog,
         steady: Callable[[], float] = monotonic,
     ) -> None:
@@ -148,12 +177,12 @@ class Connection:
         self.peer = self.error = ''
         #: Number of messages that were dropped because the peer reads too slowly.
         self.left_out = 0
-        self._settings, self._wanted = settings, wanted
+        self._settings, self._largest = settings, largest
         self._events, self._steady = events, steady
         self._listener: socket.socket | None = None
         #: The connection, established or in progress.
         self._socket: socket.socket | None = None
-        self._frames = Frames(wanted, events.reject)
+        self._frames = Frames(largest, events.reject)
         self._out = bytearray()
         #: Times of the last byte that the peer accepted, and of the last attempt to connect.
         self._moved = self._tried = -_RETRY
@@ -271,7 +300,6 @@ class Connection:
 
     def _establish(self, connection: socket.socket, peer: str) -> None:
         self._socket, self.peer = connection, peer
-        self._frames = Frames(self._wanted, self._events.reject)
         # A connection that is already closed is detected by the next read.
         with suppress(OSError):
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -293,20 +321,27 @@ class Connection:
 
     def _read(self) -> list[Frame]:
         found: list[Frame] = []
-        for _ in range(_MOST_READ // _AT_ONCE):
-            if self._socket is None:
+        left, end = _MOST_READ, self._steady() + _LONGEST_READ
+        while self._socket is not None:
+            is_large = bool(self._frames.incomplete)
+            if left <= 0 and not (is_large and self._steady() < end):
                 break
             try:
                 data = self._socket.recv(_AT_ONCE)
+                left -= len(data)
                 if data:
                     found += self._frames.take(data)
                 else:
                     self._lose('it closed the connection')
             except BlockingIOError:
-                break
+                # The peer sends the rest of a large message as soon as there is room for it.
+                if not is_large or not _is_readable(self._socket, end - self._steady()):
+                    break
             except MessageError as error:
                 self._events.reject(f'peer {self.peer} refused: {error}')
                 self._lose('it sent invalid data')
+            except MemoryError:
+                self._lose('its message exceeds the memory')
             except OSError as error:
                 self._lose(_words(error))
         return found
@@ -326,6 +361,8 @@ class Connection:
             self._moved = self._steady()
 
     def _lose(self, why: str) -> None:
+        if incomplete := self._frames.incomplete:
+            self._events.reject(f'segmentation refused: connection lost, {incomplete}')
         self._events.add(Severity.WARNING, f'{self.peer} is gone: {why}', 'gone')
         self._drop()
 
@@ -333,6 +370,7 @@ class Connection:
         if self._socket is not None:
             self._socket.close()
         self._socket, self.peer = None, ''
+        self._frames = Frames(self._largest, self._events.reject)
         self._out.clear()
 
 
@@ -341,6 +379,13 @@ def _new_socket() -> socket.socket:
     made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SYSTEM_BUFFER)
     made.setblocking(False)
     return made
+
+
+def _is_readable(connection: socket.socket, timeout: float) -> bool:
+    """Wait for bytes, at most a time [s]."""
+    ready = select.poll()
+    ready.register(connection, select.POLLIN)
+    return timeout > 0.0 and bool(ready.poll(1e3 * timeout))
 
 
 def _words(error: OSError) -> str:

@@ -15,9 +15,12 @@ import struct
 from typing import Any, Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_insertion.slicer.link import Frame, HEADER
+from needle_insertion.slicer.image import LARGEST_IMAGE, read_image
+from needle_insertion.slicer.link import Frame, HEADER, LARGEST
 from needle_insertion.slicer.needle import EntryPose, MILLIMETERS, Registration, Shape
 from needle_insertion.slicer.plan_files import PlannedShape
+from needle_planning.anatomy import SegmentationError
+from needle_planning.voxels import Layer
 from needle_ros.errors import MessageError
 from needle_ros.timing import NANOSECONDS
 import numpy as np
@@ -32,6 +35,7 @@ from pyigtl.messages import (
 
 #: Name of the target: a point name in any POINT message, or a device name.
 TARGET: Final = 'TARGET'
+SEGMENTATION: Final = 'SEGMENTATION'  #: device name of a label map
 
 #: Device names of transmitted messages.
 SHAPE: Final = 'NeedleShapeZ'
@@ -41,9 +45,15 @@ TIP_EXPECTED: Final = 'NeedleTipExpected'
 STATE: Final = 'NeedleState'
 PLAN: Final = 'NeedlePlan'
 PLAN_MODEL: Final = 'NeedlePlanModel'
+PLAN_STATE: Final = 'NeedlePlanState'
 
 #: Tolerance of a target on the skin, for 32-bit numbers and manual input [m].
 _ROUNDING: Final = 1e-4
+
+#: Sizes of the extended header, of entries and texts of metadata; number of the message.
+_EXTENDED: Final = struct.Struct('>HHII')
+
+_PART: Final = 1 << 20  #: part of a body whose checksum is computed at once [bytes]
 
 _LONGEST_STATE: Final = 8000  #: longest state [characters]; the length of a STRING has 16 bits
 
@@ -55,9 +65,16 @@ _BETWEEN: Final = re.compile(r'[\s,;]+')  #: separators of the numbers of a STRI
 _NOT_UNDERSTOOD: Final = (struct.error, ValueError, TypeError, IndexError)
 
 
-def is_wanted(kind: str, device: str) -> bool:
-    """Return whether a message of a type and a device name can contain a target."""
-    return kind == 'POINT' or (device == TARGET and kind in ('TRANSFORM', 'STRING'))
+def largest_target(kind: str, device: str) -> int:
+    """Return the largest body of a message that can contain a target [bytes], 0 for others."""
+    is_target = kind == 'POINT' or (device == TARGET and kind in ('TRANSFORM', 'STRING'))
+    return LARGEST if is_target else 0
+
+
+def largest_of_plans(kind: str, device: str) -> int:
+    """Return the largest body of a target or a segmentation [bytes], 0 for others."""
+    is_image = (kind, device) == ('IMAGE', SEGMENTATION)
+    return LARGEST_IMAGE if is_image else largest_target(kind, device)
 
 
 class Interpreter:
@@ -68,12 +85,9 @@ class Interpreter:
 
     def target(self, frame: Frame) -> FloatArray | None:
         """Return the target in ``needle_entry`` [m] or None; `MessageError` if it is invalid."""
-        found = _coordinates(_message(frame))
-        if found is None:
+        at = target_in_images(frame)
+        if at is None:
             return None
-        at = np.array(found, dtype=np.float64)
-        if at.shape != (3,) or not np.isfinite(at).all():
-            raise MessageError(f'it must be three finite numbers, got {at.tolist()}')
         point = self._registration.to_needle(at)
         distance = float(np.linalg.norm(point))
         if not distance <= self._reach:
@@ -116,12 +130,33 @@ class Interpreter:
         message = TransformMessage(matrix, timestamp=_seconds(pose.stamp), device_name=device)
         return bytes(message.pack())
 
-    def state(self, stamp: int, lines: Iterable[str]) -> bytes:
+    def state(self, stamp: int, lines: Iterable[str], device: str = STATE) -> bytes:
         """Return the states of the nodes, one line per node, as a STRING message; time in ns."""
         # pyigtl cannot encode other characters: it catches the wrong exception.
         text = '\n'.join(lines).encode('ascii', 'replace').decode()[:_LONGEST_STATE]
-        message = StringMessage(text, timestamp=_seconds(stamp), device_name=STATE)
+        message = StringMessage(text, timestamp=_seconds(stamp), device_name=device)
         return bytes(message.pack())
+
+
+def target_in_images(frame: Frame) -> FloatArray | None:
+    """Return the target in the frame of the images [mm] or None; `MessageError` if invalid."""
+    found = _coordinates(_message(frame))
+    if found is None:
+        return None
+    at = np.array(found, dtype=np.float64)
+    if at.shape != (3,) or not np.isfinite(at).all():
+        raise MessageError(f'it must be three finite numbers, got {at.tolist()}')
+    return at
+
+
+def read_segmentation(frame: Frame) -> Layer:
+    """Return the label map of an IMAGE message; `NeedleError` with its device if it is invalid."""
+    try:
+        body = _checked_body(frame)
+        version, *_ = HEADER.unpack(frame.data[: HEADER.size])
+        return read_image(_content(version, body), frame.device)
+    except (MessageError, SegmentationError) as error:
+        raise SegmentationError(f'{frame.device}: {error}') from error
 
 
 def plan_messages(shape: PlannedShape, stamp: int) -> list[bytes]:
@@ -144,11 +179,35 @@ def _millimeters(at: FloatArray) -> str:
     return f'({", ".join(f"{one:.6g}" for one in at.tolist())}) mm'
 
 
-def _message(frame: Frame) -> Any:
-    header, body = frame.data[: HEADER.size], frame.data[HEADER.size :]
-    # pyigtl does not verify the checksum.
-    if HEADER.unpack(header)[-1] != CRC64(body):
+def _checked_body(frame: Frame) -> memoryview:
+    """Return the body of a message; pyigtl does not verify the checksum."""
+    body, checksum = memoryview(frame.data)[HEADER.size :], 0
+    # In parts, between which other threads run.
+    for start in range(0, len(body), _PART):
+        checksum = CRC64(bytes(body[start : start + _PART]), checksum)
+    if HEADER.unpack(frame.data[: HEADER.size])[-1] != checksum:
         raise MessageError('the message is damaged: its checksum is wrong')
+    return body
+
+
+def _content(version: int, body: memoryview) -> memoryview:
+    """Return a body without its extended header and metadata, which version 2 has."""
+    if version < 2:
+        return body
+    if len(body) < _EXTENDED.size:
+        raise MessageError(f'has no extended header in {len(body)} bytes')
+    size, entries, texts, _ = _EXTENDED.unpack(body[: _EXTENDED.size])
+    end = len(body) - entries - texts
+    if not _EXTENDED.size <= size <= end:
+        raise MessageError(
+            f'has {len(body)} bytes, with an extended header of {size} and metadata of '
+            f'{entries + texts} bytes'
+        )
+    return body[size:end]
+
+
+def _message(frame: Frame) -> Any:
+    header, body = bytes(frame.data[: HEADER.size]), bytes(_checked_body(frame))
     try:
         fields = MessageBase.parse_header(header)
         message = MessageBase.create_message(fields['message_type'])

@@ -18,6 +18,7 @@ from needle_insertion.graph.messages import target_message
 from needle_insertion.slicer.link import Connection, LinkSettings
 from needle_insertion.slicer.needle import MILLIMETERS, NeedleView, NodeStates, Registration, Shape
 from needle_insertion.slicer.plan_files import planned_shape, PlannedShape
+from needle_insertion.slicer.planning import SlicerPlanner, SlicerPlanSettings
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.contract import Topic
@@ -54,6 +55,10 @@ class SlicerNode(BaseNode):
     images, and publishes each target until a node acknowledges it. It transmits the shape of the
     needle and the pose of its tip at 20 Hz, the predicted tip pose, and the state of all nodes
     from ``/diagnostics``. The needle of ``plan`` is transmitted to each new peer.
+
+    With ``planning.labels``, a label map (IMAGE) and a target become a plan, in a thread: its
+    needle and one line about it are transmitted, and no target is published.
+
     ``registration.*`` is the pose of ``needle_entry`` in the images. The pose of the tip is also
     published on ``tip_pose``.
 
@@ -67,12 +72,16 @@ class SlicerNode(BaseNode):
         super().__init__('slicer', **node_options)
         self.declare_settings('', LinkSettings())
         self.declare_settings('registration.', Registration())
+        self.declare_settings('planning.', SlicerPlanSettings())
         self._link: Connection | None = None
         self._events, self._view, self._states = EventLog(), NeedleView(), NodeStates()
         self._interpreter: Interpreter | None = None
         #: Needle of the plan, and the peer that has received it.
         self._planned: PlannedShape | None = None
         self._planned_at = ''
+        #: Planner, if there are labels; its last transmitted state, and the peer that has it.
+        self._planner: SlicerPlanner | None = None
+        self._told = '', ''
         self._shapes = self._targets = 0
         self._rate = RateCounter()
         #: Unanswered target with its message.
@@ -86,13 +95,19 @@ class SlicerNode(BaseNode):
                 f'the Python package {_PACKAGE} is not installed: '
                 f"python3 -m pip install '{_PACKAGE}>=0.3.4'"
             )
-        from needle_insertion.slicer.messages import Interpreter, is_wanted
+        from needle_insertion.slicer import messages
 
         settings = self.settings('', LinkSettings)
         registration = self.settings('registration.', Registration)
-        self._interpreter = Interpreter(registration, settings.reach)
+        planning = self.settings('planning.', SlicerPlanSettings)
+        largest = messages.largest_target
+        self._interpreter = messages.Interpreter(registration, settings.reach)
         self._planned = planned_shape(read_plan(settings.plan)) if settings.plan else None
-        self._link = Connection(settings, is_wanted, self._events)
+        if planning.labels:
+            read = messages.read_segmentation
+            self._planner = SlicerPlanner(planning, read, self._events, self._planned)
+            largest = messages.largest_of_plans
+        self._link = Connection(settings, largest, self._events)
         self._target = self.publisher(contract.TARGET)
         self._tip_pose = self.publisher(contract.TIP_POSE)
         # Sensor drivers may publish their shapes with the QoS of sensors.
@@ -105,7 +120,9 @@ class SlicerNode(BaseNode):
     def cleanup(self) -> None:
         if self._link is not None:
             self._link.close()
-        self._link = self._interpreter = None
+        if self._planner is not None:
+            self._planner.close()
+        self._link = self._interpreter = self._planner = None
 
     def activate(self) -> None:
         self._due = monotonic()
@@ -178,7 +195,15 @@ class SlicerNode(BaseNode):
         link, interpreter = self._link, self._interpreter
         if link is None or interpreter is None:
             return
-        self._take(interpreter, link.poll())
+        frames = link.poll()
+        if self._planner is None:
+            self._take(interpreter, frames)
+        else:
+            self._take_for_plans(self._planner, frames)
+            self._planner.poll()
+            if (planned := self._planner.shape) is not self._planned:
+                self._planned, self._planned_at = planned, ''
+            self._send_plan_state(link, interpreter, self._planner.state)
         now = monotonic()
         if now >= self._due:
             # A delay of less than a period does not delay the next shape.
@@ -239,6 +264,31 @@ class SlicerNode(BaseNode):
             'target',
         )
 
+    def _take_for_plans(self, planner: SlicerPlanner, frames: list[Frame]) -> None:
+        from needle_insertion.slicer.messages import target_in_images
+
+        # Of several segmentations and targets of the same moment, the newest are used.
+        for frame in [one for one in frames if one.kind == 'IMAGE'][-1:]:
+            planner.take_segmentation(frame)
+        newest = None
+        for frame in [one for one in frames if one.kind != 'IMAGE'][-_AT_ONCE:]:
+            try:
+                found = target_in_images(frame)
+            except MessageError as error:
+                self._events.reject(f'target refused: {error}')
+                continue
+            newest = newest if found is None else found
+        if newest is not None:
+            planner.take_target(newest)
+            self._targets += 1
+
+    def _send_plan_state(self, link: Connection, interpreter: Interpreter, state: str) -> None:
+        from needle_insertion.slicer.messages import PLAN_STATE
+
+        if (link.peer, state) != self._told and link.peer:
+            message = interpreter.state(self.now(), [state], PLAN_STATE)
+            self._told = link.peer if link.send(message) else '', state
+
     def _publish_tip(self, shape: Shape) -> None:
         message = PoseStamped()
         message.header.frame_id = contract.ENTRY
@@ -279,6 +329,7 @@ class SlicerNode(BaseNode):
             f'{contract.TIP_DEFLECTION.name} received'
         )
         broken = SlicerPhase.ERROR if link.error else SlicerPhase.WAITING
+        planning = self._planner.state if self._planner is not None else ''
         phase = SlicerPhase.CONNECTED if link.peer else broken
         status = SlicerStatus(
             phase=phase,
@@ -291,9 +342,11 @@ class SlicerNode(BaseNode):
             targets=self._targets,
             rejected=self._events.rejected,
             last_rejection=self._events.last_rejection,
+            planning=planning,
         )
         severity = Severity.ERROR if link.error else Severity.INFO
-        return Diagnosis(severity, f'{link.state}; shape: {shown}', status)
+        message = f'{link.state}; shape: {shown}' + (planning and f'; {planning}')
+        return Diagnosis(severity, message, status)
 
 
 def _quaternion(orientation: Any) -> list[float]:

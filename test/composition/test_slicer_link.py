@@ -13,7 +13,7 @@ from typing import Any
 
 from benchmarks.igtl_peer import free_port
 from needle_insertion.slicer.link import Connection, HEADER, LinkSettings
-from needle_insertion.slicer.messages import is_wanted, TARGET
+from needle_insertion.slicer.messages import largest_target, TARGET
 from needle_ros.event_log import EventLog
 import numpy as np
 import pyigtl
@@ -29,7 +29,7 @@ class Desk:
         self.port = free_port() if port is None else port
         self.events, self.ahead = EventLog(self.clock), 0.0
         settings = LinkSettings(role=role, port=self.port)
-        self.link = Connection(settings, is_wanted, self.events, self.clock)
+        self.link = Connection(settings, largest_target, self.events, self.clock)
         self.lines: list[str] = []
         self.frames: list[Any] = []
 

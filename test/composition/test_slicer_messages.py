@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from needle_insertion.slicer.link import Frame, Frames, HEADER, LARGEST, LinkSettings
 from needle_insertion.slicer.messages import (
     Interpreter,
-    is_wanted,
+    largest_target,
     SHAPE,
     SHAPE_HEADER,
     STATE,
@@ -76,7 +76,7 @@ def received(*messages: bytes) -> list[Any]:
 
 def framed(data: bytes) -> Frame:
     """Return the frame of a message."""
-    (frame,) = Frames(is_wanted, pytest.fail).take(data)
+    (frame,) = Frames(largest_target, pytest.fail).take(data)
     return frame
 
 
@@ -378,7 +378,7 @@ STREAM = b''.join(
 @given(st.lists(st.integers(0, len(STREAM)), max_size=20))
 def test_stream_is_split_independently_of_chunks(cuts: list[int]) -> None:
     """All wanted messages are returned, and unwanted messages are skipped."""
-    frames = Frames(is_wanted, pytest.fail)
+    frames = Frames(largest_target, pytest.fail)
     ends = [0, *sorted(cuts), len(STREAM)]
     found = [one for a, b in pairwise(ends) for one in frames.take(STREAM[a:b])]
     assert [one.kind for one in found] == ['POINT', 'TRANSFORM', 'STRING']
@@ -390,14 +390,14 @@ def test_stream_is_split_independently_of_chunks(cuts: list[int]) -> None:
 def test_random_bytes_are_rejected_or_skipped(data: bytes) -> None:
     """Random bytes are an error or an unwanted message."""
     with suppress(MessageError):
-        assert Frames(is_wanted, pytest.fail).take(data) == []
+        assert Frames(largest_target, pytest.fail).take(data) == []
 
 
 @pytest.mark.requirement('S-166')
 def test_oversized_messages_are_skipped_without_storage() -> None:
     """A target of a gigabyte is rejected by its header and skipped; a larger size is an error."""
     complaints: list[str] = []
-    frames = Frames(is_wanted, complaints.append)
+    frames = Frames(largest_target, complaints.append)
     large = HEADER.pack(1, b'POINT', b'TARGET', 0, 0, 1 << 30, 0)
     assert frames.take(large) == []
     assert complaints == [f'target refused: a POINT message of {1 << 30} bytes, {LARGEST} at most']
@@ -420,11 +420,11 @@ def test_message_type_names_are_printable(version: int, kind: bytes) -> None:
     header = struct.pack('>H12s', version, kind) + bytes(HEADER.size - 14)
     name = kind.rstrip(b' \0')
     if version in (1, 2, 3) and name.isascii() and name.decode('latin1').isprintable():
-        found = Frames(is_wanted, pytest.fail).take(header)
+        found = Frames(largest_target, pytest.fail).take(header)
         assert [one.kind for one in found] == ['POINT'] * (name == b'POINT')
     else:
         with pytest.raises(MessageError):
-            Frames(is_wanted, pytest.fail).take(header)
+            Frames(largest_target, pytest.fail).take(header)
 
 
 def test_only_node_requires_ros_and_only_messages_require_pyigtl() -> None:
