@@ -16,10 +16,10 @@ from typing import Any
 from benchmarks.igtl_peer import free_port, Peer, Told
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped
-from needle_insertion.slicer.link import Frame, Frames, HEADER
+from needle_insertion.slicer.link import Frame, Frames, HEADER, LARGEST
 from needle_insertion.slicer.needle import LINE, MEASURED, Registration
 from needle_insertion.slicer.slicer_node import SlicerNode
-from needle_planning import write_plan
+from needle_planning import read_plan, write_plan
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.status import node_of, SlicerPhase, SlicerStatus
 import numpy as np
@@ -29,6 +29,8 @@ import pytest
 from sensor_msgs.msg import JointState
 from support.anatomies import plan_of
 from support.ros_graph import RosGraph
+from support.slicer_anatomy import image_message, LABELS, MATRIX, VALUES
+from support.slicer_anatomy import TARGET as IN_IMAGE
 
 #: A bent needle at rest, 6 cm deep, with a displaced guide.
 PLANT = {'needle': 'bending_35mm', 'steered': True, 'mode': 'robot', 'rate': 200.0, 'depth': 0.06}
@@ -75,6 +77,72 @@ class Room:
     def status(self) -> SlicerStatus:
         """Return the latest status of the node."""
         return (self.states or [SlicerStatus()])[-1]
+
+
+class Visitor:
+    """Peer in this process: the newest message of each device of a plan."""
+
+    def __init__(self, room: Room) -> None:
+        self.found: dict[str, Frame] = {}
+        self._frames = Frames(self._largest, pytest.fail)
+        self.socket = socket.socket()
+        place = '127.0.0.1', room.port
+        room.until(lambda: not self.socket.connect_ex(place), 'a connection')
+        self.socket.setblocking(False)
+
+    @staticmethod
+    def _largest(_kind: str, device: str) -> int:
+        return LARGEST * device.startswith('NeedlePlan')
+
+    def received(self) -> dict[str, Frame]:
+        with suppress(BlockingIOError):
+            frames = self._frames.take(self.socket.recv(65536))
+            self.found.update((one.device, one) for one in frames)
+        return self.found
+
+    def message(self, device: str) -> Any:
+        """Return the last message of a device, read by pyigtl."""
+        data = self.found[device].data
+        found = MessageBase.create_message(self.found[device].kind)
+        found.unpack(MessageBase.parse_header(data[: HEADER.size]), data[HEADER.size :])
+        return found
+
+    def said(self, words: str) -> bool:
+        """Return whether the last state of the planner has some words."""
+        return 'NeedlePlanState' in self.received() and (
+            words in self.message('NeedlePlanState').string
+        )
+
+    def send(self, room: Room, data: bytes) -> None:
+        sent = 0
+
+        def send() -> bool:
+            nonlocal sent
+            self.received()
+            with suppress(BlockingIOError):
+                sent += self.socket.send(data[sent : sent + (1 << 14)])
+            return sent == len(data)
+
+        room.until(send, 'the message')
+
+    def close(self) -> None:
+        self.socket.close()
+
+
+def target_message(at: Any) -> bytes:
+    """Return a list of markups with a target [mm], as of 3D Slicer."""
+    message = pyigtl.PointMessage(np.array([at]), names=['TARGET-1'], device_name='TARGET')
+    return bytes(message.pack())
+
+
+@pytest.fixture
+def planning(tmp_path: Path) -> dict[str, Any]:
+    """Return the parameters of a node that plans, with its files."""
+    (tmp_path / 'labels.yaml').write_text(LABELS)
+    labels, output = str(tmp_path / 'labels.yaml'), str(tmp_path / 'plan.yaml')
+    return {
+        'planning.labels': labels, 'planning.output': output, 'planning.straight': True
+    }  # fmt: skip
 
 
 @pytest.fixture
@@ -194,26 +262,57 @@ def test_needle_of_a_plan_is_sent_to_each_new_peer(room: Room, tmp_path: Path) -
     write_plan(plan_of(entry, direction), tmp_path / 'plan.yaml')
     room.slicer(plan=str(tmp_path / 'plan.yaml'))
     for _ in range(2):
-        found: dict[str, Frame] = {}
-        frames = Frames(lambda _kind, device: device.startswith('NeedlePlan'), pytest.fail)
-        with closing(socket.socket()) as peer:
-
-            def receive(peer: Any = peer, frames: Frames = frames, found: Any = found) -> bool:
-                with suppress(BlockingIOError):
-                    found.update((one.device, one) for one in frames.take(peer.recv(65536)))
-                return len(found) == 2
-
-            room.until(lambda: not peer.connect_ex(('127.0.0.1', room.port)), 'a connection')
-            peer.setblocking(False)
-            room.until(receive, 'the plan')
-        assert found['NeedlePlanModel'].kind == 'POLYDATA'
-        points = MessageBase.create_message('POINT')
-        data = found['NeedlePlan'].data
-        points.unpack(MessageBase.parse_header(data[: HEADER.size]), data[HEADER.size :])
+        with closing(Visitor(room)) as peer:
+            room.until(lambda peer=peer: len(peer.received()) == 2, 'the plan')
+        assert peer.found['NeedlePlanModel'].kind == 'POLYDATA'
+        points = peer.message('NeedlePlan')
         # Messages have 24 bits.
         np.testing.assert_allclose(points.positions[0], 1e3 * entry, atol=1e-4)
         ends = 1e3 * (entry + 0.06 * direction)
         np.testing.assert_allclose(points.positions[-1], ends, atol=1e-4)
+
+
+def test_segmentation_and_target_become_a_plan(room: Room, planning: dict[str, Any]) -> None:
+    """Sent and written, by the node as a process; no target starts an insertion."""
+    room.graph.start('slicer', {'port': room.port, **planning})
+    room.until(lambda: room.states, 'the node')
+    with closing(Visitor(room)) as peer:
+        peer.send(room, image_message(VALUES, MATRIX))
+        room.until(lambda: peer.said('segmentation with 3 structures'), 'the segmentation')
+        peer.send(room, target_message(IN_IMAGE))
+        room.until(lambda: peer.said('plan for the target'), 'the plan')
+        room.until(lambda: len(peer.received()) == 3, 'the needle')
+        plan = read_plan(planning['planning.output'])
+        # Messages have 24 bits.
+        np.testing.assert_allclose(1e3 * plan.target, IN_IMAGE, atol=1e-4)
+        points = peer.message('NeedlePlan').positions
+        np.testing.assert_allclose(points[0], 1e3 * plan.entry, atol=1e-4)
+        np.testing.assert_allclose(points[-1], IN_IMAGE, atol=1e-3)
+        assert peer.found['NeedlePlanModel'].kind == 'POLYDATA'
+        peer.send(room, target_message([500.0, 0.0, 0.0]))
+        room.until(lambda: peer.said('is outside the image'), 'the failure')
+        assert peer.said('no plan for the target (500.0, 0.0, 0.0) mm')
+        room.until(lambda: 'no plan' in room.status().planning, 'the status')
+    assert room.status().targets == 2
+    assert not room.targets
+
+
+def test_lost_and_damaged_segmentations_are_one_line(room: Room, planning: dict[str, Any]) -> None:
+    """The next one is planned, for another peer and the target of the lost one."""
+    node = room.slicer(**planning)
+    image = image_message(VALUES, MATRIX)
+    with closing(Visitor(room)) as peer:
+        peer.send(room, target_message(IN_IMAGE) + image[: len(image) // 2])
+        room.until(lambda: peer.said('waits for the label map'), 'the target')
+    room.until(lambda: node.diagnose().status.rejected, 'the rejection')
+    line, lost = node.diagnose().status.last_rejection, 'connection lost, IMAGE SEGMENTATION has'
+    assert re.fullmatch(rf'segmentation refused: {lost} \d+ of {len(image)} bytes', line)
+    with closing(Visitor(room)) as peer:
+        peer.send(room, image[:-1] + b'\1')
+        room.until(lambda: peer.said('segmentation refused: SEGMENTATION: the message is'), '')
+        peer.send(room, image)
+        room.until(lambda: peer.said('plan for the target'), 'the plan')
+    assert not room.targets
 
 
 def test_predicted_tip_pose_is_sent(room: Room) -> None:
@@ -340,6 +439,8 @@ def test_slicer_ros2_can_subscribe(room: Room) -> None:
         ),
         ({'host': 'localhost'}, 'host must be an IPv4 address such as 127.0.0.1'),
         ({'role': 'both'}, 'role must be one of server, client'),
+        ({'planning.labels': 'none.yaml'}, 'none.yaml: No such file or directory'),
+        ({'planning.turns': 1}, 'turns must be 0'),
     ],
 )
 def test_invalid_parameters_are_rejected(
