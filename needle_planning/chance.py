@@ -36,7 +36,7 @@ _PART: Final = 16  #: Insertions between two reports of the progress.
 _RESAMPLED: Final = 400  #: Resamples for the interval of the tolerance.
 _LARGEST: Final = 2  #: Number of causes of failure.
 _ROWS: Final = 1024  #: Most sampled values of each cause.
-_SCENARIO: Final = 'needle_planning.plan_scenario:PlanScenario'
+_SCENARIO: Final = 'plan'
 #: Causes of failure, and the beginnings of their variables; all others are of the sensor.
 CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
     'needle and tissue': ('bending_length', 'skin', 'layer_', 'bevel_', 'path_noise'),

@@ -10,11 +10,12 @@ pose, and the true anatomy by the error of the registration. The law follows the
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import ceil, cos, hypot, pi, sin
 from pathlib import Path
 from typing import Any, Final, NamedTuple
+from zlib import crc32
 
 from needle_controller.steering.contact import monitored
 from needle_controller.steering.insertion_plan import (
@@ -48,9 +49,10 @@ from needle_dynamics.steering.parameters import SteeringParameters, with_layers,
 from needle_planning.anatomy import Anatomy, Structure
 from needle_planning.certificate import least_clearances, sag_of
 from needle_planning.clearance import Clearance
+from needle_planning.labels import read_anatomy, read_labels
 from needle_planning.paths import Line
 from needle_ros.errors import ParameterError
-from needle_ros.settings import from_values
+from needle_ros.settings import constant, from_values
 from needle_study import scenario
 from needle_study.scenario import MeasuredRun, Metric, Row, Scenario, Streams, Variable
 from needle_study.steering import SENSOR_ERRORS
@@ -63,7 +65,8 @@ _SEEDS: Final = 2**63  #: Upper bound of the seeds of paths.
 _SPACING: Final = 5e-3
 _TIGHT: Final = 5e-5  #: Largest difference between the bound and the true clearance [m].
 _BEYOND: Final = 0.02  #: Distance from the line within which the clearance is exact [m].
-_PARTS: Final = ('folder', 'radius', 'law', 'prior', 'contact')
+_FILES: Final = ('plan', 'segmentation', 'labels')
+_PARTS: Final = ('folder', 'law', 'prior', 'contact', *_FILES)
 
 #: Variables of the layers of a plan.
 LAYERS: Final = tuple(f'layer_{k + 1}' for k in range(MOST_LAYERS))
@@ -95,7 +98,7 @@ def write_inputs(folder: Path, plan: Plan, anatomies: Sequence[Anatomy]) -> None
         )
 
 
-def _read_anatomies(folder: Path) -> list[Anatomy]:
+def _read_anatomies(folder: Path) -> tuple[Anatomy, ...]:
     found = []
     for k in range(len(list(folder.glob('anatomy*.npz')))):
         with np.load(folder / f'anatomy{k}.npz') as file:
@@ -107,11 +110,32 @@ def _read_anatomies(folder: Path) -> list[Anatomy]:
         # Pages of the file are shared by all workers, and only those around the plan are read.
         labels = np.load(folder / f'labels{k}.npy', mmap_mode='r')
         found.append(Anatomy(labels=labels, to_patient=matrix, structures=structures))
-    return found
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Numbers(SteeringLimits):
+    """Limits, and the radius of a hit."""
+
+    radius: float = constant(
+        1e-3, 'm', 'largest distance of the tip from a hit target', open_low=True
+    )
+
+
+def _checksum(name: str) -> str:
+    """Return the checksum of a file, or of all files of a folder."""
+    path, value = Path(name).expanduser(), 0
+    try:
+        found = sorted(one for one in path.iterdir() if one.is_file()) if path.is_dir() else [path]
+        for one in found:
+            value = crc32(one.read_bytes(), value)
+    except OSError as error:
+        raise ParameterError(f'settings: {name}: {error.strerror}') from error
+    return f'{value:08x}'
 
 
 class _Inputs(NamedTuple):
-    """Content of the folder of a scenario."""
+    """Content of the files of a scenario."""
 
     plan: Plan
     path: PlannedPath
@@ -126,19 +150,25 @@ class PlanScenario(Scenario):
     """
     Insert needles along a plan, steered by a law, and measure tip error and clearance.
 
-    `settings` holds ``folder``, written by `write_inputs`; ``radius`` of a hit [m]; ``law``, as
-    for `build_law`; ``prior``, its fields of `SteeringPrior`; ``contact``, its fields of
-    `ContactSettings`, without which contact is not monitored; and the fields of `SteeringLimits`.
+    `settings` holds the files ``plan`` of `write_plan`, and ``segmentation`` (one or several) and
+    ``labels`` of `read_anatomy`, or a ``folder`` that `write_inputs` has written; ``radius`` of a
+    hit [m]; ``law``, as for `build_law`; ``prior``, its fields of `SteeringPrior`; ``contact``,
+    its fields of `ContactSettings`, without which contact is not monitored; and the fields of
+    `SteeringLimits`.
     """
 
     metrics, at_once = METRICS, 1
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
-        names = [item.name for item in fields(SteeringLimits)]
+        names = [item.name for item in fields(_Numbers)]
         scenario.check_names('settings: ', settings, [*_PARTS, *names])
         given = {name: value for name, value in settings.items() if name in names}
-        self._limits = from_values(SteeringLimits, given, 'settings.')
-        self._radius = float(settings['radius'])
+        self._limits = from_values(_Numbers, given, 'settings.')
+        if self._limits.turns:
+            raise ParameterError(
+                f'settings.turns must be 0: a plan has none, got {given["turns"]}'
+            )
+        self._source, self._images, self._labels = self._sources(settings)
         self._law = str(settings.get('law', DEFAULT_LAW))
         find_law(self._law)
         prior = scenario.mapping('settings: prior', settings.get('prior'))
@@ -147,7 +177,6 @@ class PlanScenario(Scenario):
         self._contact = from_values(
             ContactSettings, {'limit': 1.0, **contact}, 'settings.contact.'
         )
-        self._folder = Path(settings['folder'])
         of_prior, bevel = self._prior, 'load of the bevel beyond the nominal one'
         self.variables: Mapping[str, Variable] = {
             'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
@@ -195,16 +224,38 @@ class PlanScenario(Scenario):
             **SENSOR_ERRORS,
         }  # fmt: skip
 
+    def _sources(self, settings: Mapping[str, Any]) -> tuple[Path, list[str], str]:
+        """Return the file of the plan, and segmentations and labels, or the folder of all."""
+        given = [name for name in _FILES if name in settings]
+        if 'folder' in settings and not given:
+            return Path(settings['folder']), [], ''
+        if given != list(_FILES) or 'folder' in settings:
+            raise ParameterError(
+                f'settings must have the files {", ".join(_FILES)}, got {", ".join(settings)}'
+            )
+        images = settings['segmentation']
+        images = images if isinstance(images, list) else [images]
+        files = [settings['plan'], settings['labels'], *images]
+        if not all(isinstance(name, str) for name in files):
+            raise ParameterError(f'settings: {", ".join(_FILES)} must be names of files')
+        read_plan(settings['plan'])
+        read_labels(settings['labels'])
+        self.files = {name: _checksum(name) for name in files}
+        return Path(settings['plan']), images, settings['labels']
+
     @cached_property
     def _inputs(self) -> _Inputs:
-        """Files of the folder, which only insertions need."""
-        plan = read_plan(self._folder / _PLAN)
+        """Content of the files, which only insertions need."""
+        if self._images:
+            plan, anatomies = read_plan(self._source), read_anatomy(self._images, self._labels)
+        else:
+            plan, anatomies = read_plan(self._source / _PLAN), _read_anatomies(self._source)
         preset = find_needle(plan.needle)
         needle, steering, prior = in_layers(
             plan.layers, preset.needle, preset.steering, self._prior
         )
         clearance = Clearance(
-            _read_anatomies(self._folder),
+            anatomies,
             np.vstack([plan.entry, plan.path]),
             radius=plan.radius,
             beyond=_BEYOND + self._limits.guide_limit,
@@ -251,7 +302,7 @@ class PlanScenario(Scenario):
         clearance, tip = float(least[0]) - plant.sag, shafts[-1, -1]
         motion = np.array([row[f'target_{axis}'] for axis in 'xyz']) @ inputs.line.axes
         miss = float(np.linalg.norm(tip - inputs.plan.target - motion))
-        hit, clear = not stopped and miss <= self._radius, clearance > 0.0
+        hit, clear = not stopped and miss <= self._limits.radius, clearance > 0.0
         metrics = {
             'success': hit and clear, 'hit': hit, 'clear': clear, 'miss': miss,
             'clearance': clearance, 'tip_r': tip[0], 'tip_a': tip[1], 'tip_s': tip[2],

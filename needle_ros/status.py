@@ -300,7 +300,7 @@ class SlicerStatus(NodeStatus):
     shapes: int = entry(0, '', 'transmitted shapes')
     shape_rate: float = entry(0.0, 'Hz', 'shapes in the last second')
     left_out: int = entry(0, '', 'messages left out for a slow peer')
-    targets: int = entry(0, '', 'published targets')
+    targets: int = entry(0, '', 'accepted targets')
     rejected: int = entry(0, '', 'rejected messages')
     last_rejection: str = entry('', '', 'reason of the last rejection')
     planning: str = entry('', '', 'state of the plan for a target, empty without labels')

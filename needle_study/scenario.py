@@ -47,6 +47,8 @@ class Scenario(ABC):
     variables: Mapping[str, Variable]  #: variables of a sample
     metrics: Mapping[str, Metric]  #: metrics, the primary metric first
     at_once: int  #: samples that are simulated together
+    #: Checksum of each file that it reads: with another content, the study is another one.
+    files: Mapping[str, str] = {}
 
     def run(self, samples: Mapping[str, FloatArray], streams: Streams) -> dict[str, FloatArray]:
         """Simulate samples; return each metric, shape (n,): 1 for yes, NaN for a missing value."""
@@ -75,6 +77,7 @@ class Scenario(ABC):
 SCENARIOS: Final[Mapping[str, str]] = {
     'steering': 'needle_study.steering:SteeringScenario',
     'insertion': 'needle_study.insertion:InsertionScenario',
+    'plan': 'needle_planning.plan_scenario:PlanScenario',
 }
 
 

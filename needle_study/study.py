@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 #: Keys of a study file.
 _KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
+_FILES: Final = 'files'  #: key of the checksums of the files that the scenario reads
 
 _PARTS: Final = 50  #: largest number of parts of a study that shows its progress
 _MOST: Final = 2**30  #: largest number of samples, as limited by the Sobol sequence
@@ -160,7 +161,7 @@ def build_study(document: Any) -> Study:
     """
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
-    check_names('', document, _KEYS)
+    check_names('', document, (*_KEYS, _FILES))
     of_class = find_class('scenario', document.get('scenario'), SCENARIOS)
     if not (isinstance(of_class, type) and Scenario in of_class.__mro__):
         raise ParameterError(f'scenario {document["scenario"]!r} is not a subclass of Scenario')
@@ -188,7 +189,11 @@ def build_study(document: Any) -> Study:
                 f'be from {least:g} to {most:g}; truncate it with within: [low, high]'
             )
     factor = _factor(document.get('correlations', []), dimensions(population))
-    return Study(scenario, DESIGNS[design](samples, seed, factor), population, dict(document))
+    begun, files = mapping(_FILES, document.get(_FILES)), dict(scenario.files)
+    if changed := [name for name, checksum in begun.items() if files.get(name) != checksum]:
+        raise ParameterError(f'{changed[0]} is not the file with which the study was begun')
+    content = {**document, _FILES: files} if files else dict(document)
+    return Study(scenario, DESIGNS[design](samples, seed, factor), population, content)
 
 
 def _whole(document: Mapping[str, Any], key: str, low: int) -> int:
