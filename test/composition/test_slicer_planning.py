@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -77,8 +78,8 @@ def test_plan_is_that_of_the_anatomy(labels: Path, tmp_path: Path) -> None:
     for order in (0, 1):
         table = Table(settings_of(labels, output=str(output)))
         inputs: list[Callable[[], None]] = [
-            lambda table=table: table.planner.take_target(TARGET),
-            lambda table=table: table.planner.take_segmentation(segmentation()),
+            partial(table.planner.take_target, TARGET),
+            partial(table.planner.take_segmentation, segmentation()),
         ]
         inputs[order]()
         assert 'waits for' in table.finish()

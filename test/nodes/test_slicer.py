@@ -100,6 +100,9 @@ class Visitor:
             self.found.update((one.device, one) for one in frames)
         return self.found
 
+    def has(self, devices: int) -> bool:
+        return len(self.received()) == devices
+
     def message(self, device: str) -> Any:
         """Return the last message of a device, read by pyigtl."""
         data = self.found[device].data
@@ -263,7 +266,7 @@ def test_needle_of_a_plan_is_sent_to_each_new_peer(room: Room, tmp_path: Path) -
     room.slicer(plan=str(tmp_path / 'plan.yaml'))
     for _ in range(2):
         with closing(Visitor(room)) as peer:
-            room.until(lambda peer=peer: len(peer.received()) == 2, 'the plan')
+            room.until(partial(peer.has, 2), 'the plan')
         assert peer.found['NeedlePlanModel'].kind == 'POLYDATA'
         points = peer.message('NeedlePlan')
         # Messages have 24 bits.
@@ -281,7 +284,7 @@ def test_segmentation_and_target_become_a_plan(room: Room, planning: dict[str, A
         room.until(lambda: peer.said('segmentation with 3 structures'), 'the segmentation')
         peer.send(room, target_message(IN_IMAGE))
         room.until(lambda: peer.said('plan for the target'), 'the plan')
-        room.until(lambda: len(peer.received()) == 3, 'the needle')
+        room.until(partial(peer.has, 3), 'the needle')
         plan = read_plan(planning['planning.output'])
         # Messages have 24 bits.
         np.testing.assert_allclose(1e3 * plan.target, IN_IMAGE, atol=1e-4)
