@@ -610,7 +610,7 @@ def test_insertion_along_a_plan(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert off[-1] < 5e-4
 
 
-@pytest.mark.requirement('S-315')
+@pytest.mark.requirement('S-316')
 @pytest.mark.parametrize('action', ['stop', 'retract'])
 def test_needle_stops_before_contact_along_a_plan(
     ros_graph: RosGraph, tmp_path: Path, action: str

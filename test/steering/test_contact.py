@@ -121,7 +121,7 @@ def test_free_space_without_obstacles_changes_nothing() -> None:
     assert np.array_equal(*found)
 
 
-@pytest.mark.requirement('S-315')
+@pytest.mark.requirement('S-316')
 @pytest.mark.parametrize('depth', [0.012, 0.03, 0.05])
 def test_needle_stops_before_a_wall_across_the_path(depth: float) -> None:
     """At the latest before the motion that would reach it; the line has depth and probability."""
@@ -185,7 +185,7 @@ def test_probability_is_calibrated() -> None:
     assert np.mean(np.array(touched)[high]) > np.mean(np.array(touched)[~high])
 
 
-@pytest.mark.requirement('S-315')
+@pytest.mark.requirement('S-316')
 @pytest.mark.parametrize('side', [1.0, -1.0])
 def test_replanned_path_avoids_a_wall_that_the_needle_approaches(side: float) -> None:
     """Where the law stops without another path; the tip keeps clear, and ends at the target."""
@@ -239,7 +239,7 @@ def inserted(contact: ContactSettings, plan: Plan) -> Robot:
 WALL = plan_with({(0.03, 0.04): 0.0})
 
 
-@pytest.mark.requirement('S-315')
+@pytest.mark.requirement('S-316')
 def test_executive_stops_before_contact() -> None:
     robot = inserted(ContactSettings(), WALL)
     assert robot.loop.phase is Phase.STOPPED
@@ -248,7 +248,7 @@ def test_executive_stops_before_contact() -> None:
     assert robot.needle.depth < 0.03
 
 
-@pytest.mark.requirement('S-315')
+@pytest.mark.requirement('S-316')
 def test_executive_withdraws_before_contact() -> None:
     robot = inserted(ContactSettings(action='retract'), WALL)
     assert robot.loop.phase is Phase.IDLE
