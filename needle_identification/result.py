@@ -2,13 +2,20 @@
 """Write identified parameters to a ROS parameter file for plant, controller and steering."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import fields
-from math import atan2, hypot, isfinite, sqrt
+from math import atan2, hypot, isfinite, log, sqrt
 from pathlib import Path
 from typing import Final
 
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import between, Statistic, suffix, UNKNOWN
+from needle_identification.estimation.estimate import (
+    between,
+    ParameterEstimate,
+    Statistic,
+    suffix,
+    UNKNOWN,
+)
 from needle_identification.friction.estimate import FrictionSummary
 from needle_identification.sensor.identify import SensorEstimate
 from needle_identification.steering.estimate import SteeringEstimate
@@ -22,6 +29,11 @@ NODES: Final = ('plant', 'controller')  #: nodes that use the result
 #: Limits of the path noise of a prior [rad^2/m]: a few recordings may have none by chance, and the
 #: controller considers up to 100 times as much.
 _PATH_NOISE: Final = (1e-6, 1e-4)
+
+#: Standard deviation of the logarithm of the stiffness of a layer that is not determined to a
+#: factor of 2.
+_UNKNOWN_LAYER: Final = log(2.0)
+_WIDTH: Final = 3.92  # width of a 95 % interval over the standard deviation
 
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
@@ -60,7 +72,12 @@ def result_yaml(
 def _file(title: str, lines: Sequence[str], nodes: Mapping[str, Mapping[str, object]]) -> str:
     """Return a ROS parameter file with comments, from the parameters of each node."""
     head = [f'# {line}' for line in (f'{title}, identified by needle_identification.', *lines)]
-    sections = {f'/**/{node}': {'ros__parameters': {**own}} for node, own in nodes.items() if own}
+    # Copies of lists: ROS 2 reads no aliases.
+    sections = {
+        f'/**/{node}': {'ros__parameters': deepcopy(dict(own))}
+        for node, own in nodes.items()
+        if own
+    }
     return '\n'.join([*head, yaml.safe_dump(sections, sort_keys=False)])
 
 
@@ -97,9 +114,9 @@ def write_result(
     write_whole(path, result_yaml(friction, stiffness).encode())
 
 
-def steering_yaml(found: SteeringEstimate) -> str:
+def steering_yaml(found: SteeringEstimate, needle: str | None = None) -> str:
     """Return a ROS parameter file for plant, controller and steering node, errors as comments."""
-    # Imported here for the same reason.
+    # `needle`: name of the nominal needle, or its file. Imported here for the same reason.
     from needle_dynamics.parameters import NeedleParameters, PAPER_NEEDLE
     from needle_dynamics.steering.parameters import tissue_of
 
@@ -109,17 +126,20 @@ def steering_yaml(found: SteeringEstimate) -> str:
             f'{", ".join(medium.medium for medium in found.media)}'
         )
     (medium,) = found.media
-    length = medium['bending_length']
-    if not length.determined:
-        raise IdentificationError('the data do not determine the bending length')
-    # The data determine lengths, not forces: the bending stiffness is the default.
-    stiffness = NeedleParameters.preset(PAPER_NEEDLE).bending_stiffness
+    length, layers = medium['bending_length'], medium.layers
+    if not any(one.determined for one in layers or (length,)):
+        what = 'stiffness of any layer' if layers else 'bending length'
+        raise IdentificationError(f'the data do not determine the {what}')
+    # The data determine lengths, not forces: the bending stiffness is the nominal one.
+    needle = needle or PAPER_NEEDLE
+    nominal = found.tissue or NeedleParameters.preset(PAPER_NEEDLE)
+    stiffness = nominal.bending_stiffness
     tissue = tissue_of(stiffness, length.value)
     lines = []
     for one in (found.free_length, *medium.parameters):
         known = f'SE {one.error:.2g}' if one.determined else UNKNOWN
         lines.append(f'{one.symbol} ({one.name}) = {one.value:.6g}{suffix(one.unit)}, {known}')
-    lines.append(f'E I = {stiffness:g} N m^2 of the needle {PAPER_NEEDLE}')
+    lines.append(f'E I = {stiffness:g} N m^2 of the needle {needle}')
     if medium.held_out is not None:
         lines.append(
             f'error of predicted recordings {medium.held_out.rms:.3g} m, '
@@ -129,7 +149,7 @@ def steering_yaml(found: SteeringEstimate) -> str:
         f'path noise {medium.path_noise:.3g} rad^2/m, noise of a reading {medium.noise:.3g} m'
     )
     low, high = _PATH_NOISE
-    prior = {'prior.path_noise': _short(min(max(medium.path_noise, low), high))}
+    prior: dict[str, object] = {'prior.path_noise': _short(min(max(medium.path_noise, low), high))}
     # Also if they are not determined: the bending length is for these values.
     lengths: dict[str, object] = {
         'steering.free_length': _short(found.free_length.value),
@@ -140,13 +160,26 @@ def steering_yaml(found: SteeringEstimate) -> str:
         z, x = (medium[f'curvature_{axis}'].value for axis in 'zx')
         steering['steering.bevel_load'] = [_short(hypot(x, z) * stiffness / length.value)]
         lines.append(f'the bevel pushes along z at a roll of {-atan2(x, z):.4g} rad')
-    model = {'needle': PAPER_NEEDLE, 'model.tissue_stiffness': _short(tissue)}
+    model: dict[str, object] = {'needle': needle, 'model.tissue_stiffness': _short(tissue)}
+    if layers:
+        model['model.layer_depths'] = list(nominal.layer_depths)
+        pairs = zip(nominal.layer_stiffnesses, layers[1:], strict=True)
+        model['model.layer_stiffnesses'] = [_short(k * one.value) for k, one in pairs]
+        prior['prior.layer_spread'] = [_short(_layer_spread(one)) for one in layers]
     nodes = {
         'plant': {**model, **steering},
         'controller': model,
         'steering': {**model, **lengths, **prior},
     }
     return _file('Steered needle', lines, nodes)
+
+
+def _layer_spread(layer: ParameterEstimate) -> float:
+    """Return the standard deviation of the logarithm of the stiffness of a layer."""
+    if not layer.determined:
+        return _UNKNOWN_LAYER
+    low, high = layer.interval
+    return log(high / low) / _WIDTH
 
 
 def sensor_yaml(found: SensorEstimate, measurement_time: float, *, delayed: bool) -> str:

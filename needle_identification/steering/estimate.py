@@ -4,9 +4,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
+from needle_dynamics.parameters import NeedleParameters
 from needle_identification.estimation.estimate import (
     DisplayedEstimate,
     EstimateRows,
@@ -29,6 +30,15 @@ CONSTANTS: Mapping[str, tuple[str, str]] = {
     'curvature_x': ('kappa_x', '1/m'),
 }
 
+#: Name of the stiffness of a layer over its nominal one, with its number from 1.
+LAYER: Final = 'layer_'
+
+
+def symbol_and_unit(name: str) -> tuple[str, str]:
+    if name.startswith(LAYER):
+        return f'k_{name.removeprefix(LAYER)}/k_nominal', '1'
+    return CONSTANTS[name]
+
 
 class HeldOut(NamedTuple):
     """Errors of recordings that are predicted from the others of their medium."""
@@ -43,7 +53,8 @@ class MediumEstimate(DisplayedEstimate):
     """Constants of the needle in a medium; ``estimate[name]`` is a parameter."""
 
     medium: str  #: name of the medium
-    parameters: tuple[ParameterEstimate, ...]  #: bending length, skin, and drift constants
+    #: Bending length (of the first layer), skin, stiffness of layers, and drift constants.
+    parameters: tuple[ParameterEstimate, ...]
     rms: float  #: root mean square of the residuals, per axis [m]
     noise: float  #: standard deviation of the white noise of a reading [m]
     path_noise: float  #: growth of the variance of the path direction per length [rad^2/m]
@@ -54,6 +65,11 @@ class MediumEstimate(DisplayedEstimate):
 
     def __getitem__(self, name: str) -> ParameterEstimate:
         return named(self.parameters, name)
+
+    @property
+    def layers(self) -> tuple[ParameterEstimate, ...]:
+        """Stiffness of each layer over its nominal one; empty for uniform tissue."""
+        return tuple(one for one in self.parameters if one.name.startswith(LAYER))
 
     def rows(self) -> EstimateRows:
         return ((self.medium, one) for one in self.parameters)
@@ -71,6 +87,7 @@ class SteeringEstimate(DisplayedEstimate):
     residuals: tuple[FloatArray, ...]  #: measured minus fitted tips, (samples, 2) [m]
     optima: int  #: number of distinct optima
     warnings: tuple[str, ...] = ()  #: warnings about the validity of the values
+    tissue: NeedleParameters | None = None  #: nominal needle in its tissue, if it was given
 
     def __getitem__(self, medium: str) -> MediumEstimate:
         for one in self.media:

@@ -29,18 +29,33 @@ References
 
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf, isfinite, log1p, sqrt
+from functools import cache, partial
+from math import exp, inf, isfinite, log1p, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.display import Progress, progress_of
+from needle_dynamics.parameters import NeedleParameters
+from needle_dynamics.steering.parameters import bending_length
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate
-from needle_identification.steering.estimate import CONSTANTS, MediumEstimate, SteeringEstimate
+from needle_identification.steering.estimate import (
+    LAYER,
+    MediumEstimate,
+    SteeringEstimate,
+    symbol_and_unit,
+)
 from needle_identification.steering.mixed import MixedModel, variances
-from needle_identification.steering.recording import ORDERS, readings, SteeringRecording, TERMS
+from needle_identification.steering.recording import (
+    NominalLayers,
+    ORDERS,
+    readings,
+    SteeringRecording,
+    TERMS,
+    UNIFORM,
+)
 from needle_identification.steering.search import (
     FREE,
     held_out,
@@ -48,7 +63,7 @@ from needle_identification.steering.search import (
     Optimum,
     rms_of,
     Search,
-    shown,
+    skin_of,
     Tips,
 )
 from needle_ros.errors import ParameterError
@@ -57,7 +72,6 @@ import numpy as np
 from scipy.special import stdtrit
 
 _WORSE: Final = 1.5  # smallest ratio of held-out errors and residuals that is reported
-_LENGTHS: Final = 2  # number of nonlinear constants of a medium
 _LEAST: Final = 1e-4  # least weight of a ratio of variances, for intervals and predictions
 #: Path noise that is reported [rad^2/m]: the path turns by 2 degrees in 0.1 m.
 _WANDERS: Final = 0.01
@@ -72,6 +86,9 @@ class SteeringSettings:
     terms: tuple[str, ...] | None = None  #: drift terms; None selects the best
     order: str | None = None  #: ``together`` or ``guide first``; None selects the better
     free_length: float | None = None  #: known free length [m]; None to estimate it
+    #: Nominal needle in its tissue; if this has layers, the stiffness of each over its nominal one
+    #: is estimated. None: uniform tissue.
+    tissue: NeedleParameters | None = None
 
     def __post_init__(self) -> None:
         for term in self.terms or ():
@@ -83,6 +100,20 @@ class SteeringSettings:
             raise ParameterError(
                 f'free_length must be in [{low:g}, {high:g}] m, got {self.free_length!r}'
             )
+        if self.tissue is not None and min(self.tissue.tissue.stiffnesses) <= 0.0:
+            raise ParameterError(
+                'each layer of tissue needs a nominal stiffness > 0 N/m^2, got '
+                f'{", ".join(f"{one:g}" for one in self.tissue.tissue.stiffnesses)}'
+            )
+
+    @property
+    def layers(self) -> NominalLayers:
+        """Layers whose stiffness is estimated."""
+        if self.tissue is None or len(self.tissue.tissue.starts) == 1:
+            return UNIFORM
+        tissue, stiffness = self.tissue.tissue, self.tissue.bending_stiffness
+        lengths = (bending_length(stiffness, one) for one in tissue.stiffnesses)
+        return NominalLayers(tissue.starts, tuple(lengths))
 
 
 def identify_steering(
@@ -93,13 +124,16 @@ def identify_steering(
     """
     Identify free length, bending length, skin and drift from recorded insertions.
 
+    With a nominal needle in layers of tissue, each layer has its own stiffness. A layer that the
+    recordings do not determine to a factor of 2 has the value that the others were fitted with.
+
     Parameters
     ----------
     recordings : sequence of SteeringRecording
         Recordings. All share the free length; recordings of the same medium share bending
         length, skin and drift constants; each recording has a separate offset.
     settings : SteeringSettings, optional
-        Drift terms, order and free length.
+        Drift terms, order, free length and layers.
     progress : bool or callable, optional
         True shows a progress bar; a function is called after each search.
 
@@ -123,17 +157,18 @@ def identify_steering(
     fits: list[_Fit] = []
     with progress_of(progress, len(orders) * len(sets), 'fits') as advance:
         for order in orders:
-            tips, optima = Tips(read, order), list[Optimum]()
+            tips, optima = Tips(read, order, settings.layers), list[Optimum]()
             for terms in sets:
-                _check(read, terms)
                 search = Search(tips, terms, settings.free_length)
+                _check(read, terms, search.width)
                 # The lengths hardly depend on the drift terms.
                 optima = search.optima([one.x for one in optima])
                 fits.append(_Fit(search, optima))
                 advance()
     best = min(fit.selection for fit in fits)
     ranked = [fit._replace(gap=fit.selection - best) for fit in fits]
-    return _estimate(sorted(ranked, key=lambda fit: fit.gap))
+    found = _estimate(sorted(ranked, key=lambda fit: fit.gap))
+    return replace(found, tissue=settings.tissue)
 
 
 class _Fit(NamedTuple):
@@ -143,16 +178,18 @@ class _Fit(NamedTuple):
 
     @property
     def selection(self) -> float:
-        return sum(one.selection for one in self.search.fits(self.optima[0].x))
+        x = self.optima[0].x
+        apart = float(np.sum(self.search.apart(x) ** 2))
+        return sum(one.selection for one in self.search.fits(x)) + apart
 
 
-def _check(recordings: Sequence[SteeringRecording], terms: tuple[str, ...]) -> None:
+def _check(recordings: Sequence[SteeringRecording], terms: tuple[str, ...], lengths: int) -> None:
     for one in recordings:
         if not one.samples:
             raise IdentificationError(f'{one.name}: no valid sample of the tip')
     for medium in dict.fromkeys(one.medium for one in recordings):
         members = [one.samples for one in recordings if one.medium == medium]
-        unknown = _LENGTHS + 1 + 2 * len(members) + sum(len(TERMS[term]) for term in terms)
+        unknown = lengths + 1 + 2 * len(members) + sum(len(TERMS[term]) for term in terms)
         if 2 * sum(members) <= unknown:
             raise IdentificationError(
                 f'{unknown} constants of {medium or "these recordings"} need more than '
@@ -179,7 +216,7 @@ def _freedom(search: Search, x: FloatArray) -> FloatArray:
     found = np.full(len(x), inf)
     parts = zip(search.models, search.fits(x), search.spreads(x), strict=True)
     for medium, (model, one, spread) in enumerate(parts):
-        known = model.freedom - len(one.drift) - _LENGTHS - 1
+        known = model.freedom - len(one.drift) - search.width - 1
         each = np.diagonal(spread, axis1=1, axis2=2)
         mean = one.weights @ each
         # The ratios of the deviations are uncertain, too.
@@ -201,7 +238,7 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
     fits, residuals = search.fits(best.x), search.residuals(best.x)
     information = search.information(best.x)
     freedom = [
-        model.freedom - len(one.drift) - _LENGTHS - 1
+        model.freedom - len(one.drift) - search.width - 1
         for model, one in zip(search.models, fits, strict=True)
     ]
     rises = [
@@ -210,30 +247,43 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
     ]
     alike = [first, *(_refined(fit) for fit in ranked[1:] if fit.gap < max(rises))]
 
-    def length(name: str, at: int, rise: float) -> ParameterEstimate:
-        """Return a length with its profile interval, if guide or roll alone determine it."""
-        x, step = float(best.x[at]), 1e-6
-        if np.ptp(search.bounds[:, at]) ** 2 * information[at] <= 4.0 * rise:
-            return _constant(name, shown(name, x))
-        ends = [
+    @cache
+    def ends(at: int) -> tuple[float, float]:
+        """Return the profile interval of a variable, if guide or roll alone determine it."""
+        rise = rises[at]
+        if search.ranges[at] ** 2 * information[at] <= 4.0 * rise:
+            return -inf, inf
+        each = [
             interval(fit.search, fit.optima, at, rise - fit.gap) for fit in alike if fit.gap < rise
         ]
-        low, high = min(low for low, _ in ends), max(high for _, high in ends)
-        if name == 'skin':
+        low, high = min(low for low, _ in each), max(high for _, high in each)
+        return (-inf, inf) if search.ranges[at] < high - low < inf else (low, high)
+
+    def length(name: str, at: int, shown: Callable[[float], float]) -> ParameterEstimate:
+        """Return the constant of a variable with its interval."""
+        x, step = float(best.x[at]), 1e-6
+        low, high = ends(at)
+        if name == 'skin' and high < inf:
             # The lower bound of the skin is zero.
             low = max(low, 0.0)
         if not (isfinite(low) and isfinite(high)):
-            return _constant(name, shown(name, x))
-        error = sqrt(best.spread[at, at]) * (shown(name, x + step) - shown(name, x)) / step
-        return _constant(name, shown(name, x), error, shown(name, low), shown(name, high))
+            return _constant(name, shown(x))
+        error = sqrt(best.spread[at, at]) * abs(shown(x + step) - shown(x)) / step
+        return _constant(name, shown(x), error, *sorted((shown(low), shown(high))))
+
+    def layers(medium: int) -> Iterator[ParameterEstimate]:
+        """Return the stiffness of each layer over its nominal one."""
+        pairs = zip(search.layers(medium), search.tips.layers.lengths, strict=True)
+        for k, (at, nominal) in enumerate(pairs if search.layered else (), 1):
+            yield length(f'{LAYER}{k}', at, partial(_stiffness_ratio, nominal))
 
     if search.known is None:
-        free = length('free_length', 0, rises[0])
+        free = length('free_length', 0, exp)
     else:
         free = _constant('free_length', search.known, 0.0, search.known, search.known)
     media = []
     for k, (medium, members) in enumerate(search.members.items()):
-        at = len(best.x) - _LENGTHS * (len(fits) - k)
+        at = search.layers(k)[0]
         one, left = fits[k], [residuals[own] for own in members]
         paths = variances(search.models[k].ratios) * one.variances[:, np.newaxis]
         path_noise, slopes = (one.weights @ paths).tolist()
@@ -241,8 +291,9 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
             MediumEstimate(
                 medium=medium,
                 parameters=(
-                    length('bending_length', at, rises[at]),
-                    length('skin', at + 1, rises[at + 1]),
+                    length('bending_length', at, exp),
+                    length('skin', at + 1, skin_of),
+                    *layers(k),
                     *_drift(search, best, k, float(stdtrit(freedom[k], 0.975))),
                 ),
                 rms=rms_of(left),
@@ -264,6 +315,11 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
         optima=len(first.optima),
         warnings=tuple(_warnings(alike, min(rises), alternatives, media)),
     )
+
+
+def _stiffness_ratio(nominal: float, variable: float) -> float:
+    """Return the stiffness over the nominal one, for a nominal bending length [m]."""
+    return (nominal / exp(variable)) ** 4
 
 
 def _drift(
@@ -290,7 +346,7 @@ def _constant(
     name: str, value: float, error: float = inf, low: float = -inf, high: float = inf
 ) -> ParameterEstimate:
     """Return a constant; without a bounded interval it is undetermined, with the value used."""
-    symbol, unit = CONSTANTS[name]
+    symbol, unit = symbol_and_unit(name)
     found = ParameterEstimate(name=name, symbol=symbol, unit=unit, value=value)
     if not (isfinite(low) and isfinite(high)):
         return found
@@ -327,7 +383,7 @@ def _warnings(
         each = ' or '.join(
             f'{1e3 * length:.1f} mm with skin {1e3 * skin:.1f} mm'
             for one in near
-            for _, length, skin in search.lengths(one.x)
+            for _, length, skin, *_ in search.lengths(one.x)
         )
         yield f'{len(near)} sets of lengths fit alike, the intervals contain all: lambda {each}'
     for one in media:

@@ -40,6 +40,16 @@ TERMS: Final = {
 _ELEMENT: Final = 1.5e-3
 
 _CAUSES: Final = np.arange(3)
+
+
+class NominalLayers(NamedTuple):
+    """Depth at which each layer of tissue begins, and its nominal bending length [m]."""
+
+    starts: tuple[float, ...]
+    lengths: tuple[float, ...]
+
+
+UNIFORM: Final = NominalLayers((0.0,), (1.0,))  #: the bending length is unknown
 _NO_WANDER: Final = np.zeros((1, 0, 2))
 
 
@@ -204,7 +214,8 @@ class TipResponses(NamedTuple):
 class SimulatedCauses:
     """A recorded insertion for each cause, in one order; the lengths are given later."""
 
-    def __init__(self, recording: SteeringRecording, order: str) -> None:
+    def __init__(self, recording: SteeringRecording, order: str, starts: Sequence[float]) -> None:
+        self._starts = starts
         depth, guide = recording.depth, recording.guide - recording.guide[0]
         poses = np.zeros((3, len(depth), 6))
         poses[:, :, 0] = depth
@@ -223,16 +234,17 @@ class SimulatedCauses:
         step = float(np.median(steps[steps > _ELEMENT])) if (steps > _ELEMENT).any() else _ELEMENT
         self._element = step / ceil(step / _ELEMENT - 1e-6)
 
-    def responses(self, free: float, length: float, skin: float) -> TipResponses:
-        """Simulate the insertion for lengths in m, and skin over tissue stiffness."""
+    def responses(self, free: float, length: float, skin: float, *deeper: float) -> TipResponses:
+        """Simulate the insertion for lengths in m by layer, and skin over tissue stiffness."""
         # The response depends only on lengths: unit bending stiffness.
         reach, element, tissue = self._deepest + free, self._element, 4.0 / length**4
         constants = np.array([[1.0, element, skin * tissue, 0.0, 0.0, reach, free]])
-        layers = np.zeros((3, 3, 1))
-        layers[:, 1] = tissue
+        layers = np.zeros((3, 3, len(self._starts)))
+        layers[:, 0] = self._starts
+        layers[:, 1] = [tissue, *(4.0 / one**4 for one in deeper)]
         layers[2, 2] = 1.0 / length
         tips = np.empty((3, self._poses.shape[1], 2))
-        cut = empty_cut(reach, element, 1)
+        cut = empty_cut(reach, element, len(self._starts))
         insert(constants, layers, 1.0, _NO_WANDER, self._poses, _CAUSES, cut, tips, NO_FORCES)
         guide, tilt, bevel = tips[:, :: self._every]
         return TipResponses(guide=guide, tilt=tilt[:, 1], bevel=bevel)

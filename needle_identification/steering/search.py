@@ -11,9 +11,11 @@ from needle_identification.steering.estimate import HeldOut
 from needle_identification.steering.mixed import covariance, Likelihood, MixedModel
 from needle_identification.steering.recording import (
     drift,
+    NominalLayers,
     SimulatedCauses,
     SteeringRecording,
     TipResponses,
+    UNIFORM,
 )
 import numpy as np
 from scipy.optimize import least_squares
@@ -22,6 +24,12 @@ from scipy.special import chdtri, stdtrit
 FREE: Final = (1e-3, 0.3)  #: bounds of the free length [m]
 LENGTH: Final = (4e-3, 0.5)  #: bounds of the bending length [m]
 SKIN: Final = (0.0, 0.5)  #: bounds of the skin [m]
+#: Standard deviation of the logarithm of the stiffness of a layer over its nominal one, around the
+#: mean of all layers: weak, for layers that the recordings hardly determine.
+_LAYERS: Final = 1.0
+#: Interval of the logarithm of the bending length of a layer that is determined: the stiffness is
+#: known to a factor of 2.
+_KNOWN: Final = 0.5 * log(2.0)
 _SCALE: Final = 0.02  # the search variable of the skin is skin / (skin + scale) [m]
 
 #: Grid of the global search: free lengths, bending lengths and skins [m].
@@ -44,15 +52,17 @@ _ANY: Final = 1.0  # standard deviation of the offset [m]
 class Tips:
     """Tip responses of recordings at given lengths, in one order of guide and insertion."""
 
-    def __init__(self, recordings: Sequence[SteeringRecording], order: str) -> None:
-        self.recordings, self.order = recordings, order
+    def __init__(
+        self, recordings: Sequence[SteeringRecording], order: str, layers: NominalLayers = UNIFORM
+    ) -> None:
+        self.recordings, self.order, self.layers = recordings, order, layers
         self.moved = [np.column_stack([one.depth, one.guide])[one.known] for one in recordings]
         self.measured = [one.tip[one.known].T for one in recordings]  # (2, n) [m]
-        self._insertions = [SimulatedCauses(one, order) for one in recordings]
+        self._insertions = [SimulatedCauses(one, order, layers.starts) for one in recordings]
         self.of = lru_cache(maxsize=8000)(self._responses)
 
-    def _responses(self, at: int, free: float, length: float, skin: float) -> TipResponses:
-        return self._insertions[at].responses(free, length, skin)
+    def _responses(self, at: int, *lengths: float) -> TipResponses:
+        return self._insertions[at].responses(*lengths)
 
 
 class Optimum(NamedTuple):
@@ -73,7 +83,8 @@ class Search:
     Likelihood of recorded insertions as a function of the lengths.
 
     The variables are the logarithm of the free length, unless ``free`` [m] is given, and for each
-    medium the logarithm of the bending length, and skin / (skin + scale).
+    medium the logarithm of the bending length, skin / (skin + scale), and the logarithms of the
+    bending length in deeper layers.
     """
 
     def __init__(
@@ -84,6 +95,7 @@ class Search:
         models: Sequence[MixedModel] = (),
     ) -> None:
         self.tips, self.terms, self.known = tips, terms, free
+        self.width = 1 + len(tips.layers.starts)  #: number of variables of a medium
         media = [one.medium for one in tips.recordings]
         self.members = {
             medium: [k for k, other in enumerate(media) if other == medium]
@@ -94,26 +106,53 @@ class Search:
         ]
         ends = zip(FREE, LENGTH, SKIN, strict=True)
         self.bounds = np.array([self.variables(*end, len(self.members)) for end in ends])
+        #: Length of the longest interval of each variable that is determined.
+        self.ranges = np.ptp(self.bounds, axis=0)
+        if self.layered:
+            for medium in range(len(self.members)):
+                of_layers = self.layers(medium)
+                self.bounds[:, of_layers] = np.log(LENGTH)[:, np.newaxis]
+                self.ranges[of_layers] = _KNOWN
         self._part = lru_cache(maxsize=64)(self._fit)
 
     def variables(self, free: float, length: float, skin: float, media: int = 1) -> FloatArray:
         """Return the search variables for the same lengths [m] of all media."""
-        own = [log(length), skin / (skin + _SCALE)] * media
+        own = [log(length), skin / (skin + _SCALE), *map(log, self._deeper(length))] * media
         return np.array(own if self.known is not None else [log(free), *own])
 
-    def lengths(self, x: FloatArray) -> list[tuple[float, float, float]]:
-        """Return free length, bending length and skin of each medium [m]."""
+    def lengths(self, x: FloatArray) -> list[tuple[float, ...]]:
+        """Return free length, bending length, skin, and deeper lengths of each medium [m]."""
         own = x.tolist()
         free = self.known if self.known is not None else exp(own.pop(0))
-        pairs = zip(own[::2], own[1::2], strict=True)
-        return [(free, exp(length), _SCALE * u / (1.0 - u)) for length, u in pairs]
+        each = [own[k : k + self.width] for k in range(0, len(own), self.width)]
+        return [(free, exp(length), skin_of(u), *map(exp, deeper)) for length, u, *deeper in each]
 
-    def design(
-        self, at: int, free: float, length: float, skin: float
-    ) -> tuple[FloatArray, FloatArray]:
+    def _deeper(self, length: float) -> list[float]:
+        """Return the bending lengths of deeper layers with nominal ratios to the first [m]."""
+        first, *deeper = self.tips.layers.lengths
+        return [length * one / first for one in deeper]
+
+    @property
+    def layered(self) -> bool:
+        return len(self.tips.layers.starts) > 1
+
+    def layers(self, medium: int) -> list[int]:
+        """Return the indices of the bending length in each layer."""
+        first, _, *deeper = self.own(medium)[-self.width :]
+        return [first, *deeper]
+
+    def apart(self, x: FloatArray) -> FloatArray:
+        """Return the deviations of layers from the mean of their medium, over the prior one."""
+        if not self.layered:
+            return np.zeros(0)
+        nominal = np.log(self.tips.layers.lengths)
+        logs = [4.0 * (nominal - x[self.layers(k)]) for k in range(len(self.members))]
+        return np.concatenate([(one - one.mean()) / _LAYERS for one in logs])
+
+    def design(self, at: int, *lengths: float) -> tuple[FloatArray, FloatArray]:
         """Return the response to the guide (2, n), and to the drift constants (2, n, c)."""
         one = self.tips.recordings[at]
-        r = self.tips.of(at, free, length, skin)
+        r = self.tips.of(at, *lengths)
         columns = np.hstack([drift(term, one, r) for term in self.terms])
         columns = columns.reshape(2, len(one.depth), -1)
         return r.guide[one.known].T, columns[:, one.known]
@@ -121,17 +160,17 @@ class Search:
     def fits(self, x: FloatArray) -> list[Likelihood]:
         return [self._part(k, *own) for k, own in enumerate(self.lengths(x))]
 
-    def _fit(self, medium: int, free: float, length: float, skin: float) -> Likelihood:
+    def _fit(self, medium: int, *lengths: float) -> Likelihood:
         members = list(self.members.values())[medium]
-        parts = [self.design(at, free, length, skin) for at in members]
+        parts = [self.design(at, *lengths) for at in members]
         left = [
             self.tips.measured[at] - guide for at, (guide, _) in zip(members, parts, strict=True)
         ]
         return self.models[medium].likelihood([columns for _, columns in parts], left)
 
     def deviance(self, x: FloatArray) -> float:
-        """Return -2 log likelihood of all media."""
-        return sum(one.deviance for one in self.fits(x))
+        """Return -2 log likelihood of all media, with the prior of layers."""
+        return sum(one.deviance for one in self.fits(x)) + float(np.sum(self.apart(x) ** 2))
 
     def descend(self, first: FloatArray, free: Sequence[int] | None = None) -> Optimum:
         """Search over variables with these indices: least squares by the weights of each round."""
@@ -189,11 +228,14 @@ class Search:
     def own(self, medium: int) -> list[int]:
         """Return the indices of the variables on which a medium depends."""
         first = int(self.known is None)
-        return [*range(first), *range(first + 2 * medium, first + 2 * medium + 2)]
+        begin = first + self.width * medium
+        return [*range(first), *range(begin, begin + self.width)]
 
     def spreads(self, x: FloatArray) -> list[FloatArray]:
         """Return the covariances (K, k, k) of the variables of each medium, by ratio."""
         changed = [(step, self.fits(there)) for step, there in self.steps(x)]
+        apart = self.apart(x)
+        prior = np.array([(self.apart(there) - apart) / step for step, there in self.steps(x)])
         found: list[FloatArray] = []
         for medium, one in enumerate(self.fits(x)):
             scale = np.sqrt(one.variances)[:, np.newaxis]
@@ -201,6 +243,7 @@ class Search:
             each = [(there.residuals - one.residuals) / (step * scale) for there, step in steps]
             jacobian = np.stack(each, axis=-1)
             normal = np.swapaxes(jacobian, 1, 2) @ jacobian
+            normal += prior[self.own(medium)] @ prior[self.own(medium)].T
             # A deviation of 1 if they are not determined.
             found.append(np.asarray(np.linalg.inv(normal + np.eye(len(steps)))))
         return found
@@ -227,9 +270,8 @@ class Search:
     ) -> FloatArray:
         x[at] = values
         parts = zip(factors, self.fits(x), strict=True)
-        return np.concatenate(
-            [(own * one.residuals)[own[:, 0] > 0.0].ravel() for own, one in parts]
-        )
+        found = [(own * one.residuals)[own[:, 0] > 0.0].ravel() for own, one in parts]
+        return np.concatenate([*found, self.apart(x)])
 
     def optima(self, near: Sequence[FloatArray] = ()) -> list[Optimum]:
         """Return distinct optima, the best first; from a grid without near points."""
@@ -244,20 +286,23 @@ class Search:
         for skin in _SKINS:
             trials = []
             for free in _FREES if self.known is None else [self.known]:
-                x, total = self.variables(free, 1.0, skin)[:-2], 0.0
+                x, total = self.variables(free, 1.0, skin)[: -self.width], 0.0
                 for k in range(len(self.members)):
-                    each = {one: self._part(k, free, one, skin).deviance for one in _LENGTHS}
+                    each = {
+                        one: self._part(k, free, one, skin, *self._deeper(one)).deviance
+                        for one in _LENGTHS
+                    }
                     best = min(_LENGTHS, key=each.__getitem__)
-                    x = np.append(x, self.variables(free, best, skin)[-2:])
+                    x = np.append(x, self.variables(free, best, skin)[-self.width :])
                     total += each[best]
                 trials.append((total, x))
             starts.append(min(trials, key=lambda one: one[0])[1])
         return starts
 
 
-def shown(name: str, variable: float) -> float:
-    """Return the length [m] with this name and search variable."""
-    return _SCALE * variable / (1.0 - variable) if name == 'skin' else exp(variable)
+def skin_of(variable: float) -> float:
+    """Return the skin [m] of a search variable."""
+    return _SCALE * variable / (1.0 - variable)
 
 
 def interval(
@@ -326,7 +371,8 @@ def held_out(search: Search, best: Optimum, medium: int) -> HeldOut | None:
         depths = [*models[medium].depths[:k], *models[medium].depths[k + 1 :]]
         whole = models[medium]
         models[medium] = MixedModel(depths, whole.ratios, whole.penalties)
-        fitted = Search(Tips(others, search.tips.order), search.terms, search.known, models)
+        tips = Tips(others, search.tips.order, search.tips.layers)
+        fitted = Search(tips, search.terms, search.known, models)
         found.append(predict(search, fitted, fitted.descend(best.x), medium, at))
     rms, freedom = rms_of([one.errors for one in found]), 2 * len(found)
     low, high = (rms * sqrt(freedom / float(chdtri(freedom, p))) for p in (0.025, 0.975))

@@ -8,9 +8,11 @@ from pathlib import Path
 import re
 from typing import Any
 
+from needle_dynamics.needles import find_needle
+from needle_dynamics.parameters import NeedleParameters, PAPER_NEEDLE
 from needle_identification.estimation.estimate import between, measured, ParameterEstimate
 from needle_identification.recordings.tables import column_roles
-from needle_identification.steering.estimate import HeldOut, SteeringEstimate
+from needle_identification.steering.estimate import HeldOut, LAYER, SteeringEstimate
 from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
 from needle_identification.steering.recording import ORDERS, SteeringRecording, TERMS
 from needle_insertion.commands import common
@@ -73,6 +75,13 @@ def add_steering(what: Any) -> None:
         '(default: the most likely order)',
     )
     common.add_quantity(fitting, '--free-length', 'm', 'known free length (default: fitted)')
+    nominal = fitting.add_mutually_exclusive_group()
+    common.add_needle(
+        nominal, None, f'{PAPER_NEEDLE}, in uniform tissue; the stiffness of each layer is fitted'
+    )
+    nominal.add_argument(
+        '--plan', type=Path, metavar='FILE', help='plan of `needle plan -o` with needle and layers'
+    )
     parser.set_defaults(identify=_run)
 
 
@@ -94,6 +103,20 @@ def _medium_of(path: Path, pattern: re.Pattern[str] | None) -> str:
     return str(match[1])
 
 
+def _nominal(options: argparse.Namespace) -> tuple[str, NeedleParameters | None]:
+    """Return the name of the nominal needle, and the needle in its tissue if it was given."""
+    if options.plan is not None:
+        # Imported here: most runs have no plan.
+        from needle_controller.steering.insertion_plan import in_layers, read_plan
+
+        plan = read_plan(options.plan)
+        preset = find_needle(plan.needle)
+        return plan.needle, in_layers(plan.layers, preset.needle, preset.steering).needle
+    if options.needle is not None:
+        return options.needle, find_needle(options.needle).needle
+    return PAPER_NEEDLE, None
+
+
 def _run(options: argparse.Namespace) -> int:
     # A large import, which the other subcommands do not need.
     from needle_identification import identify_steering, SteeringSettings
@@ -101,7 +124,10 @@ def _run(options: argparse.Namespace) -> int:
 
     common.check_file(options.output)
     terms = options.terms and tuple(common.words_of(options.terms))
-    settings = SteeringSettings(terms=terms, order=options.order, free_length=options.free_length)
+    name, tissue = _nominal(options)
+    settings = SteeringSettings(
+        terms=terms, order=options.order, free_length=options.free_length, tissue=tissue
+    )
     reading = {name: getattr(options, name) for name in ('tip_topic', 'motion_topic', 'time')}
     reading['columns'] = column_roles(options.columns, STEERING_ROLES) if options.columns else {}
     recordings = list[SteeringRecording]()
@@ -120,7 +146,7 @@ def _run(options: argparse.Namespace) -> int:
         found = identify_steering(recordings, settings, lambda: show(f'fit {next(fits)}'))
     common.print_each('warning', found.warnings)
     written, errors = common.try_write(
-        options.output, lambda path: write_whole(path, steering_yaml(found).encode())
+        options.output, lambda path: write_whole(path, steering_yaml(found, name).encode())
     )
     document = steering_document(found, recordings)
     common.print_result(document, steering_text(found), written, as_json=options.json)
@@ -147,13 +173,18 @@ def _predicted(one: HeldOut | None) -> str:
     return f'{1e3 * one.rms:.3f} ({between((low, high))})'
 
 
+def _undetermined(one: ParameterEstimate) -> str:
+    used = f' ({one.value:.3g} used)' if one.name.startswith(LAYER) else ''
+    return f'not determined{used}'
+
+
 def steering_text(found: SteeringEstimate) -> str:
     parameters = [(one.medium or _ONE, each) for one in found.media for each in one.parameters]
     rows = [
         (
             medium,
             title_of(one),
-            measured(one.value, one.error) if one.determined else 'not determined',
+            measured(one.value, one.error) if one.determined else _undetermined(one),
             # A given free length has no error.
             interval_of(one) if one.error else '',
         )
@@ -174,6 +205,9 @@ def steering_text(found: SteeringEstimate) -> str:
     others = ', '.join(
         f'{"+".join(terms)} {1e3 * rms:.3f} mm' for terms, rms in found.alternatives.items()
     )
+    layers = ', '.join(
+        f'{one["stiffness"]:.4g} N/m^2 from {1e3 * one["depth"]:g} mm' for one in _layers(found)
+    )
     motion = 'move together' if found.order == ORDERS[0] else 'move one after the other'
     return '\n'.join(
         [
@@ -182,8 +216,20 @@ def steering_text(found: SteeringEstimate) -> str:
             table(fits, _FITS),
             '',
             f'drift by {"+".join(found.terms)}; rms by cause: {others}; guide and needle {motion}',
+            *([f'k_nominal: {layers}'] if layers else []),
         ]
     )
+
+
+def _layers(found: SteeringEstimate) -> list[dict[str, float]]:
+    """Return depth [m] and nominal stiffness [N/m^2] of each fitted layer."""
+    if found.tissue is None or not found.media[0].layers:
+        return []
+    tissue = found.tissue.tissue
+    return [
+        {'depth': depth, 'stiffness': stiffness}
+        for depth, stiffness in zip(tissue.starts, tissue.stiffnesses, strict=True)
+    ]
 
 
 def steering_document(
@@ -208,6 +254,7 @@ def steering_document(
             }
             for medium in found.media
         },
+        **({'nominal_layers': layers} if (layers := _layers(found)) else {}),
         'terms': list(found.terms),
         'order': found.order,
         'optima': found.optima,
