@@ -211,7 +211,7 @@ def _one(case: int, seed: int) -> _Fit:
 
 
 #: Layered cases: number of layers, and of insertions per fit.
-_LAYERED: Final = ((2, 4), (3, 4), (3, 10))
+_LAYERED: Final = ((2, 4), (3, 4))
 
 
 def layered(seed: int, layers: int) -> FitTruth:
