@@ -620,7 +620,7 @@ def test_needle_stops_before_contact_along_a_plan(
     free = plan.free.copy()
     free[free[:, 0] >= 0.03, 1:] = 0.0
     write_plan(replace(plan, free=free), file)
-    bench = Bench(ros_graph, plan=str(file), guide_step=3e-3, **{'contact.action': action})
+    bench = Bench(ros_graph, plan=str(file), guide_step=3e-3, contact__action=action)
     truth = ros_graph.listen(bench.user, JointState, 'ground_truth', SENSOR)
     x, z = plan.tip_path.tips[-1].tolist()
     bench.aim((x, plan.length, z))

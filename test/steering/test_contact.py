@@ -118,7 +118,7 @@ def test_free_space_without_obstacles_changes_nothing() -> None:
         plant = plant_of(0.02)
         simulate_steering(law, plant, lambda tip: tip)
         found.append(plant.tip)
-    assert np.array_equal(*found)
+    assert np.array_equal(found[0], found[1])
 
 
 @pytest.mark.requirement('S-316')
@@ -134,13 +134,13 @@ def test_needle_stops_before_a_wall_across_the_path(depth: float) -> None:
 
 def test_mirrored_needle_and_walls_have_mirrored_probabilities() -> None:
     """The law is symmetric to rounding; a probability may be steep in the deviation."""
-    found = []
+    found: list[list[float]] = []
     for sign in (1.0, -1.0):
         plan = plan_with({(0.02, 0.04): wall(sign, 6e-4)})
         mirror = np.eye(3) - (1.0 - sign) * np.outer(PLAN.axes[0], PLAN.axes[0])
         tips = PLAN.entry + (PLAN.path - PLAN.entry) @ mirror
         law = monitored_law(replace(plan, guide=sign * PLAN.guide, path=tips), NEVER)
-        plant, probabilities = plant_of(sign * 0.02), []
+        plant, probabilities = plant_of(sign * 0.02), list[float]()
 
         def watch(
             _plant: SteeringPlant, law: MonitoredLaw = law, seen: list[float] = probabilities
@@ -150,7 +150,7 @@ def test_mirrored_needle_and_walls_have_mirrored_probabilities() -> None:
         simulate_steering(law, plant, lambda tip: tip, watch)
         found.append(probabilities)
     assert max(found[0]) > 1e-3
-    assert_allclose(*found, rtol=1e-6, atol=1e-9)
+    assert_allclose(found[0], found[1], rtol=1e-6, atol=1e-9)
 
 
 def test_probability_is_calibrated() -> None:
