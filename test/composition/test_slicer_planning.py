@@ -118,6 +118,7 @@ def without(*values: int) -> Any:
     return changed
 
 
+@pytest.mark.requirement('S-315')
 @pytest.mark.parametrize(
     ('values', 'reason'),
     [
