@@ -722,7 +722,7 @@ def test_damaged_tables_and_other_versions_are_rejected(
 @pytest.mark.parametrize(
     ('change', 'complaint'),
     [
-        ({'scenario': 'fishing'}, 'scenario must be one of steering, insertion, or module:Class'),
+        ({'scenario': 'fishing'}, 'must be one of steering, insertion, plan, or module:Class'),
         ({'scenario': 'no_module:Class'}, 'cannot be imported: No module'),
         ({'scenario': 'json:JSONDecoder'}, 'is not a subclass of Scenario'),
         ({'population': {'skin': {'triangular': [1, 3, 2]}}}, 'must have low <= mode <= high'),
