@@ -6,18 +6,17 @@ Depth after one second of a needle with uncertain friction: mean and standard de
 twenty needles from Table 1 of the paper.
 """
 
-from needle_dynamics import NeedleModel, NeedleParameters, simulate_batch
+from needle_dynamics import NeedleArray, NeedleModel, NeedleParameters, simulate_batch
 import numpy as np
 
 
 def main() -> None:
     """Draw 100 needles and push each with 3 N."""
     rng = np.random.default_rng(seed=1)
-    needles = [
-        NeedleParameters.preset('phantom', coulomb_friction=mu_s, viscous_friction=mu_v)
-        for mu_s, mu_v in rng.normal((0.56, 300.0), (0.0374, 44.7), size=(100, 2))
-    ]
-    start = NeedleModel(needles[0]).state_at(depth=0.02)
+    mu_s, mu_v = rng.normal((0.56, 300.0), (0.0374, 44.7), size=(100, 2)).T
+    base = NeedleParameters.preset('phantom')
+    needles = NeedleArray(base, coulomb_friction=mu_s, viscous_friction=mu_v)
+    start = NeedleModel(base).state_at(depth=0.02)
 
     # keep=False keeps the end of each run only.
     batch = simulate_batch(needles, start, 3.0, duration=1.0, interval=1e-2, keep=False)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from needle_dynamics.parameters import Tissue as Tissue
     from needle_dynamics.simulated.batch import simulate_batch as simulate_batch
     from needle_dynamics.simulated.integrator import Integrator as Integrator
+    from needle_dynamics.simulated.needle_array import NeedleArray as NeedleArray
     from needle_dynamics.simulated.trajectory import simulate as simulate
     from needle_dynamics.simulated.trajectory import Trajectory as Trajectory
     from needle_dynamics.steering.batch import insert_batch as insert_batch

@@ -32,13 +32,13 @@ LARGEST_CONDITION: Final = 1e11
 
 #: Least insertion depth over l with cond(G) <= LARGEST_CONDITION, for 1, 2, ... modes. G depends
 #: only on this ratio. The table allows parameter checks without compiled code.
-_LEAST_RATIOS: Final = (
+LEAST_RATIOS: Final = (
     0.0, 1.27099e-4, 0.0943411, 0.228479, 0.332967, 0.410300, 0.474010, 0.526876, 0.571028,
     0.608223, 0.639854, 0.667005,
 )  # fmt: skip
 
 #: Maximum number of modes; more are distinguishable only at large insertion depths.
-MOST_MODES: Final = len(_LEAST_RATIOS)
+MOST_MODES: Final = len(LEAST_RATIOS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,7 +202,7 @@ class NeedleParameters:
     def _check_modes(self) -> None:
         n = self.modes
         check_whole('modes', n, 1, MOST_MODES)
-        least = _LEAST_RATIOS[n - 1] * self.length
+        least = LEAST_RATIOS[n - 1] * self.length
         if self.minimum_depth < least:
             raise ParameterError(
                 f'{n} modes cannot be distinguished at minimum_depth = {self.minimum_depth:g} m, '

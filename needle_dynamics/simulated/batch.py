@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from math import ceil, inf
-from operator import attrgetter
 import os
 from typing import Final
 
@@ -22,6 +21,7 @@ from needle_dynamics.model import NeedleModel, ROUNDING
 from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
+from needle_dynamics.simulated.needle_array import columns_of, NeedleArray
 from needle_dynamics.simulated.trajectory import checked_tolerance, count_of, floats, refined
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -30,17 +30,16 @@ from numpy.typing import ArrayLike
 
 _CHUNK: Final = 256  #: largest number of runs per task, enough to fill all vector lanes
 
-#: Constants of the lanes that are attributes of `NeedleParameters`; read after the first three.
+#: Constants of the lanes that are attributes of `NeedleParameters`.
 _OWN: Final = [one for one in Constants._fields if hasattr(NeedleParameters, one)]
 _ONE_MODE: Final = [0, 1, 2, 4, 5, 6]  #: entries of a state in the lanes for a single mode
-_READ: Final = attrgetter('minimum_depth', 'reach', 'hub_stop', *_OWN)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Batch:
     """Result of many simulated runs."""
 
-    parameters: tuple[NeedleParameters, ...]  #: constants of each run, or one for all
+    parameters: Sequence[NeedleParameters]  #: constants of each run, or one for all
     #: Time of the k + 1 samples [s], and states, shape (runs, k + 1, 2 (2 + n)), NaN after a run
     #: has left its range; one sample for final states only.
     time: FloatArray
@@ -60,8 +59,8 @@ class Batch:
     @property
     def depth(self) -> FloatArray:
         """Insertion depths [m], shape (runs, k + 1)."""
-        lengths = np.array([p.length for p in self.parameters])[:, np.newaxis]
-        return np.asarray(lengths - self.states[:, :, 0])
+        lengths = columns_of(self.parameters, ['length'])['length']
+        return np.asarray(lengths[:, np.newaxis] - self.states[:, :, 0])
 
     @property
     def velocity(self) -> FloatArray:
@@ -71,11 +70,12 @@ class Batch:
     @property
     def tip_deflection(self) -> FloatArray:
         """Tip deflections [m], shape (runs, k + 1)."""
-        models = [NeedleModel(p) for p in self.parameters]
-        if len(models) == 1:
-            return models[0].tip_deflections(self.states)
-        runs = zip(models, self.states, strict=True)
-        return np.array([model.tip_deflections(states) for model, states in runs])
+        shared = columns_of(self.parameters, ['length', 'reach'])
+        if all((values == values[0]).all() for values in shared.values()):
+            # The modes are the same.
+            return NeedleModel(self.parameters[0]).tip_deflections(self.states)
+        runs = zip(self.parameters, self.states, strict=True)
+        return np.array([NeedleModel(p).tip_deflections(states) for p, states in runs])
 
 
 def simulate_batch(
@@ -99,7 +99,8 @@ def simulate_batch(
     Parameters
     ----------
     parameters : NeedleParameters or sequence of them
-        Constants, for all runs or for each. All must have the same number of modes.
+        Constants, for all runs or for each; a `NeedleArray` has arrays of those that differ. All
+        must have the same number of modes.
     states : array_like, shape (runs, 2 (2 + n)) or (2 (2 + n),)
         Initial states.
     forces, torques : array_like, shape (), (runs,) or (runs, k)
@@ -148,7 +149,11 @@ def simulate_batch(
     0.0115 m/s
 
     """
-    each = [parameters] if isinstance(parameters, NeedleParameters) else list(parameters)
+    each: Sequence[NeedleParameters]
+    if isinstance(parameters, NeedleArray):
+        each = parameters
+    else:
+        each = (parameters,) if isinstance(parameters, NeedleParameters) else tuple(parameters)
     starts = np.atleast_2d(floats('states', states))
     pushes, turns = (
         values.reshape(-1, 1) if values.ndim < 2 else values
@@ -180,7 +185,7 @@ def simulate_batch(
             each, ends, inputs, tolerance, keep=keep, workers=workers, progress=advance
         )
     time = np.arange(count + 1, dtype=np.float64) * interval
-    return Batch(tuple(each), time if keep else time[-1:], kept, completed * interval, error)
+    return Batch(each, time if keep else time[-1:], kept, completed * interval, error)
 
 
 def number_of_runs(**counts: int) -> int:
@@ -277,13 +282,11 @@ def _take_one_mode(
 
 def _check(each: Sequence[NeedleParameters], starts: FloatArray) -> None:
     """Reject initial states like `NeedleModel.checked_state`, but vectorized."""
-    length, least, columns = np.array(
-        [(p.length, p.minimum_depth, 4 + 2 * p.modes) for p in each]
-    ).T
+    columns = columns_of(each, ['length', 'minimum_depth', 'reach', 'modes'])
+    length, least, reach, modes = columns.values()
     depth = length - starts[:, 0]
-    high = np.array([p.reach for p in each]) * length
-    valid = (least - ROUNDING * length <= depth) & (depth <= high)
-    valid &= (columns == starts.shape[1]) & np.isfinite(starts).all(axis=1)
+    valid = (least - ROUNDING * length <= depth) & (depth <= reach * length)
+    valid &= (4 + 2 * modes == starts.shape[1]) & np.isfinite(starts).all(axis=1)
     for i in np.flatnonzero(~valid).tolist():
         NeedleModel(each[i % len(each)]).checked_state(starts[i % len(starts)])
 
@@ -292,8 +295,10 @@ def lane_groups(
     each: Sequence[NeedleParameters], runs: int, *, together: bool = True
 ) -> dict[float | None, IntArray]:
     """Group the runs by the reach of a shared mode table; None for runs without one."""
-    reaches = [p.reach if together and _fits(p) else None for p in each]
-    if len(each) == 1:
+    alike = isinstance(each, NeedleArray) or len(each) == 1
+    some = each[:1] if alike else each
+    reaches = [p.reach if together and _fits(p) else None for p in some]
+    if alike:
         return {reaches[0]: np.arange(runs)}
     return {
         one: np.array([i for i, reach in enumerate(reaches) if reach == one])
@@ -307,32 +312,80 @@ def _fits(p: NeedleParameters) -> bool:
 
 def lane_constants(each: Sequence[NeedleParameters]) -> FloatArray:
     """Return the rows of `Constants`, shape (runs, 19)."""
-    values = np.array([_READ(p) for p in each], dtype=np.float64).T
-    columns = dict(zip(_OWN, values[3:], strict=True))
-    least, reach, stops = values[:3]
+    columns = columns_of(each, ['minimum_depth', 'reach', 'hub_stop', *_OWN])
+    least, reach, stops = (columns.pop(name) for name in ('minimum_depth', 'reach', 'hub_stop'))
     length = columns['length']
     columns['lowest'] = least - ROUNDING * length
     columns['highest'] = reach * length
     columns['stop'] = np.where(stops, length, inf)
-    columns['law'] = np.array([LAW_NUMBERS[p.friction_law] for p in each], dtype=np.float64)
+    if isinstance(each, NeedleArray):
+        columns['law'] = np.full(len(each), LAW_NUMBERS[each.base.friction_law], dtype=np.float64)
+    else:
+        columns['law'] = np.array([LAW_NUMBERS[p.friction_law] for p in each], dtype=np.float64)
     return np.column_stack([columns[name] for name in Constants._fields])
 
 
 def lane_layers(each: Sequence[NeedleParameters]) -> FloatArray:
     """Return the layers of `lanes.run`, shape (runs, m, `LAYER` + pairs of modes)."""
+    if isinstance(each, NeedleArray):
+        return _layers_of(each)
     varied = [k for k, p in enumerate(each) if _fits(p) and (p.swelling or p.layer_depths)]
     most = max((1 + len(each[k].layer_depths) for k in varied), default=0)
-    modes = each[0].modes
+    found = _uniform(each, most, each[0].modes)
+    for k in varied:
+        layers = NeedleModel(each[k]).compiled.layers
+        rows = _layer_rows(layers.starts, layers.stiffnesses, layers.gram)
+        found[k, : len(rows), : rows.shape[1]] = rows
+    return found
+
+
+def _uniform(each: Sequence[NeedleParameters], most: int, modes: int) -> FloatArray:
+    """Return the layers of needles in uniform tissue, with space for ``most`` layers."""
     found = np.zeros((len(each), most, LAYER + max(3, modes * (modes + 1) // 2)))
     if most:
         found[:, 1:, 0] = inf
-        found[:, 0, 1] = [p.tissue_stiffness for p in each]
-    for k in varied:
-        layers = NeedleModel(each[k]).compiled.layers
-        gram = layers.gram[(slice(None), *np.triu_indices(modes))]
-        rows = np.column_stack([layers.starts, layers.stiffnesses, gram])
-        found[k, : len(rows), : rows.shape[1]] = rows
+        found[:, 0, 1] = columns_of(each, ['tissue_stiffness'])['tissue_stiffness']
     return found
+
+
+def _layer_rows(starts: FloatArray, stiffnesses: FloatArray, gram: FloatArray) -> FloatArray:
+    """Return layers, shape (..., m), as (..., m, columns), with the sums above, (..., n, n)."""
+    upper = gram[(..., *np.triu_indices(gram.shape[-1]))]
+    return np.concatenate([np.stack([starts, stiffnesses], axis=-1), upper], axis=-1)
+
+
+def _layers_of(each: NeedleArray) -> FloatArray:
+    """Return `lane_layers` of needles whose constants are arrays."""
+    base, (depths, stiffnesses) = each.base, each.layers
+    modes, (runs, further) = base.modes, depths.shape
+    most = 1 + further if further or each.column('swelling').any() else 0
+    found = _uniform(each, most if _fits(base) else 0, modes)
+    if not found.shape[1] or not further:
+        return found
+    gram = np.zeros((runs, most, modes, modes))
+    own = np.column_stack([each.column('tissue_stiffness'), stiffnesses])
+    for i, at in enumerate(_grams_at_layers(each, depths), start=1):
+        change = own[:, i - 1] - own[:, i]
+        gram[:, i] = gram[:, i - 1] + change[:, np.newaxis, np.newaxis] * at
+    rows = _layer_rows(np.column_stack([np.zeros(runs), depths]), own, gram)
+    found[..., : rows.shape[2]] = rows
+    return found
+
+
+def _grams_at_layers(each: NeedleArray, depths: FloatArray) -> FloatArray:
+    """Return the mode integrals G at layers, shape (layers, runs or 1, n, n)."""
+    lengths, base = each.column('length'), each.base
+    if not {'length', 'layer_depths'} & each.constants.keys():
+        lengths, depths = lengths[:1], depths[:1]
+    found = [
+        [
+            mode_shapes(length, base.modes, base.reach)
+            .integrals(min(depth, base.reach * length)).gram
+            for depth in row
+        ]
+        for length, row in zip(lengths.tolist(), depths.tolist(), strict=True)
+    ]  # fmt: skip
+    return np.array(found).swapaxes(0, 1)
 
 
 @cache
