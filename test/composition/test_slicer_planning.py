@@ -127,7 +127,6 @@ def without(*values: int) -> Any:
         (-VALUES, 'has the value -'),
     ],
 )
-@pytest.mark.requirement('S-315')
 def test_refused_segmentation_is_one_line(labels: Path, values: Any, reason: str) -> None:
     """It replaces the one before, which is another anatomy."""
     table = Table(settings_of(labels))
