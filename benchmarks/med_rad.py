@@ -96,15 +96,16 @@ def main(folder: Path, needle: Path) -> None:
             used = process_time() - begin
             length = 1e3 * np.linalg.norm(pair.target - pair.start)
             shown = [f'{1e3 * plan.clearance:.2f}' if plan else '-' for plan, _ in plans]
-            rows.append((pair.name, f'{length:.0f}', f'{pair.slope:.2f}', *shown, f'{used:.1f}'))
+            size = f'{length:.0f}', f'{pair.slope:.2f}'
+            rows.append((pair.name, *size, *shown, f'{used:.1f}'))
             reasons += [
                 f'- {pair.name}, {where}: {plan[1]}'
                 for where, plan in (('from the start', plans[0]), ('within 20 mm', plans[-1]))
                 if plan[0] is None
             ]
     head = (
-        'pair', 'length [mm]', 'slope', 'from the start, bowed [mm]', 'straight, within 20 mm [mm]',
-        'bowed, within 20 mm [mm]', 'processor time [s]',
+        'pair', 'length [mm]', 'slope', 'from the start, bowed [mm]',
+        'straight, within 20 mm [mm]', 'bowed, within 20 mm [mm]', 'processor time [s]',
     )  # fmt: skip
     sys.stdout.write('\n'.join([table(head, rows), '', *reasons, '']))
 
