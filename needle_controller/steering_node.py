@@ -73,7 +73,8 @@ class SteeringNode(CompiledNode):
     where the record leaves them.
 
     With ``plan``, a file of ``needle plan``, an insertion has the steps of the plan, and its tip
-    follows the path; a target must have the depth of the plan.
+    follows the path; a target must have the depth of the plan. Above a probability of contact of
+    ``contact.limit`` the needle stops, is withdrawn, or follows another path.
 
     The node passes messages to an `SteeringExecutive`, which decides, and publishes its motions.
     """

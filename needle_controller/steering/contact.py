@@ -271,8 +271,10 @@ class MonitoredLaw:
         # The inserted needle is moved by the next motion of the guide.
         before, _ = inserted_shape(needle, shaft.places)
         x, z = forecast.guide[first].tolist()
+        load = needle.guide_load[0]
         needle.move(guide=(x + _SHIFT, z))
         shift = (inserted_shape(needle, shaft.places)[0] - before)[:, 0] / _SHIFT
+        stiffness = float(needle.guide_load[0, 0] - load[0]) / _SHIFT
         along = np.zeros((len(shift) + int(later.sum()), n))
         along[: len(shift), 0] = shift
         along[len(shift) :] = _between(self._places[later], at, moves)
@@ -282,7 +284,9 @@ class MonitoredLaw:
         guide = forecast.guide
         last = np.vstack([guide[first - 1] if first else np.zeros(2), guide[first:]])
         miss = self.target - forecast.means[-1]
-        change = most_clearance(free, gap, along, moves[-1], miss, last, self._limits)
+        change = most_clearance(
+            free, gap, along, moves[-1], miss, last, self._limits, load, stiffness
+        )
         if change is None:
             return None
         guide, tips = guide.copy(), self._path.tips.copy()

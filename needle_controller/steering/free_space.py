@@ -83,6 +83,8 @@ def most_clearance(
     miss: FloatArray,
     guide: FloatArray,
     limits: SteeringLimits,
+    load: FloatArray,
+    stiffness: float,
 ) -> FloatArray | None:
     """
     Return the change of guide setpoints for the largest clearance of all points.
@@ -106,6 +108,10 @@ def most_clearance(
         Guide before these steps, and in each of them [m].
     limits : SteeringLimits
         Limits of the guide.
+    load : ndarray, shape (2,)
+        Lateral force of the guide in the first step [N].
+    stiffness : float
+        Change of this force per motion of the guide [N/m].
 
     Returns
     -------
@@ -136,6 +142,13 @@ def most_clearance(
     now, wide = guide[1:].T.ravel(), np.full(2 * n, np.inf)
     low = np.concatenate([-most - now, np.zeros(2 * n), [-np.inf]])
     high = np.concatenate([most - now, wide, [_ENOUGH]])
+    if np.isfinite(limits.load_limit) and stiffness > 0.0:
+        # The law limits the load of later steps.
+        first = [0, n]
+        low[first] = np.maximum(low[first], (-limits.load_limit - load) / stiffness)
+        high[first] = np.minimum(high[first], (limits.load_limit - load) / stiffness)
+        if (low > high).any():
+            return None
     ranges = np.column_stack([low, high])
     found = linprog(cost, np.vstack(rows), np.concatenate(bounds), bounds=ranges)
     return found.x[: 2 * n].reshape(2, n).T if found.status == 0 else None

@@ -16,7 +16,7 @@ from needle_controller import (
     SteeringPrior,
 )
 from needle_controller.steering.contact import MonitoredLaw
-from needle_controller.steering.free_space import probability_outside, UNITS
+from needle_controller.steering.free_space import most_clearance, probability_outside, UNITS
 from needle_controller.steering.insertion_plan import DIRECTIONS, Plan
 from needle_controller.steering.law import build_law, ContactError
 from needle_controller.steering.settings import ContactSettings
@@ -206,6 +206,31 @@ def test_replanned_path_avoids_a_wall_that_the_needle_approaches(side: float) ->
             assert side * (x - np.interp(depth, path.depths, path.tips[:, 0])) < 3e-4
     # 0.5 mm of the path, and the remaining error of the law.
     assert np.abs(plant.tip - path.tips[-1]).max() < 7e-4
+
+
+@pytest.mark.requirement('S-316')
+@pytest.mark.parametrize('load_limit', [0.3, 0.6, 8.0])
+def test_replanned_setpoint_keeps_the_limits_of_the_guide(load_limit: float) -> None:
+    """Position, change and force on the nominal needle, to the tolerance of the program."""
+    limits = SteeringLimits(load_limit=load_limit)
+    free, rng = np.full((20, DIRECTIONS), 1e-3), np.random.default_rng(4)
+    off, response = 5e-4 * rng.standard_normal((20, 2)), rng.uniform(0.0, 1.0, (20, 6))
+    guide, load = 2e-4 * rng.standard_normal((7, 2)), np.array([0.2, -0.1])
+    found = most_clearance(
+        free, off, response, response[-1], np.zeros(2), guide, limits, load, 300.0
+    )
+    assert found is not None
+    moved = guide[1:] + found
+    assert np.abs(moved).max() <= limits.guide_limit + 1e-8
+    assert np.abs(np.diff(np.vstack([guide[:1], moved]), axis=0)).max() <= limits.guide_step + 1e-8
+    assert np.abs(load + 300.0 * found[0]).max() <= load_limit + 1e-6
+    assert np.abs(response[-1] @ found).max() <= 5e-4 + 1e-8
+    # Not less clearance than without a change.
+
+    def least(change: FloatArray) -> float:
+        return float((free - (off + response @ change) @ UNITS.T).min())
+
+    assert least(found) >= min(least(np.zeros((6, 2))), 2e-3) - 1e-8
 
 
 def test_law_without_a_forecast_needs_a_limit_of_one() -> None:
