@@ -66,9 +66,9 @@ $(VENV)/.docs: requirements-docs.lock $(VENV)/.complete
 # Pins for all supported Python versions; run after a change of dependencies in setup.py.
 lock:
 	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
-		--extra ros setup.py requirements-build.in -o requirements.lock
+		--extra ros --extra plan setup.py requirements-build.in -o requirements.lock
 	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
-		--extra ros --extra dev --constraints requirements.lock \
+		--extra ros --extra plan --extra dev --constraints requirements.lock \
 		setup.py requirements-build.in -o requirements-dev.lock
 	uv pip compile --quiet --universal --python-version 3.10 --no-annotate --no-header \
 		--extra docs --constraints requirements-dev.lock setup.py -o requirements-docs.lock
