@@ -159,8 +159,8 @@ def identify_steering(
         for order in orders:
             tips, optima = Tips(read, order, settings.layers), list[Optimum]()
             for terms in sets:
+                _check(read, terms, 1 + len(settings.layers.starts))
                 search = Search(tips, terms, settings.free_length)
-                _check(read, terms, search.width)
                 # The lengths hardly depend on the drift terms.
                 optima = search.optima([one.x for one in optima])
                 fits.append(_Fit(search, optima))
