@@ -45,7 +45,7 @@ wheel: setup
 
 # The marker is written last: an interrupted setup restarts. Older versions of pip install without a word.
 $(VENV)/.complete: requirements.lock setup.py package.xml
-	@echo 'installing 750 MB into $(VENV), a minute or two'
+	@echo 'installing 760 MB into $(VENV), a minute or two'
 	@test ! -L $(VENV) || rm $(VENV)  # A link leads to another environment, which venv would empty.
 	$(PYTHON) -m venv --clear --without-pip $(VENV)
 	$(BIN)/python -m ensurepip --default-pip

@@ -27,6 +27,7 @@ from needle_ros.errors import NeedleError
 from reproduction.campaign import Campaign
 from reproduction.content import Check, CHECK_HEADS
 from reproduction.insertions import aiming, bending, insertion
+from reproduction.plan import plan_insertion
 from reproduction.protocol import PROTOCOLS
 from reproduction.record import rig
 from reproduction.truth import compare_friction, compare_stiffness, Coverage, TruthComparison
@@ -43,7 +44,8 @@ _INTRODUCTION: Final = (
     f'Nodes over DDS at {insertion.RATE:g} Hz: insertion from '
     f'{insertion.START_DEPTH * 100:g} cm to {insertion.TARGET_DEPTH * 100:g} cm at '
     f'{insertion.SPEED * 1000:g} mm/s, of a needle that bends and under two control laws, and of '
-    'one that is steered to a target, recorded to MCAP; friction and tissue stiffness identified '
+    'one that is steered to a target, recorded to MCAP; a path planned in a synthetic liver '
+    '(plan/plan.html); friction and tissue stiffness identified '
     'from the shipped simulated recordings and one fresh recording each, '
     f'made at {EXPERIMENT_SPEED:g} times real time.'
 )
@@ -88,6 +90,10 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
         ):
             running.record(output / name, parameters, EXPERIMENT_SPEED, partial(show, 'recording'))
 
+    with ProgressLine('plan') as show:
+        show('synthetic liver')
+        checks = plan_insertion(output / 'plan')
+
     friction: list[FrictionEstimate] = []
     stiffness: list[StiffnessEstimate] = []
     compared: dict[str, list[list[TruthComparison]]] = {'friction': [], 'stiffness': []}
@@ -111,7 +117,7 @@ def run(output: Path, bags: Path, *, lockstep: bool = True) -> int:
 
     with ProgressLine('report') as show:
         show('checking the bent needle')
-        checks = bending.bending_checks(bent)
+        checks += bending.bending_checks(bent)
         show('checking the steered needle')
         checks += aiming.aiming_checks(aimed, alone)
         checks += [check for one in insertions for check in insertion.insertion_checks(one)]

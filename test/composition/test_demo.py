@@ -23,8 +23,10 @@ from reproduction.insertions.insertion import (
     RecordedInsertion,
     TARGET_DEPTH,
 )
+from reproduction.plan import plan_checks
 from reproduction.protocol import SHIPPED_BAGS
 from reproduction.truth import compare_friction, compare_stiffness, TruthComparison
+from support.plans import bowed_plan
 
 
 def insertion(
@@ -137,3 +139,23 @@ def test_demo_removes_only_its_own_files(tmp_path: Path) -> None:
     with pytest.raises(DemoError, match='holds no stiffness recordings'):
         run(tmp_path / 'new', bags)
     assert not (tmp_path / 'new').exists()
+
+
+@pytest.mark.parametrize(
+    ('change', 'verdicts'),
+    [
+        ({}, [True, True, True]),
+        ({'straight_bound': 4e-3}, [False, True, True]),
+        ({'straight_bound': 1e-4}, [False, True, True]),
+        ({'least': 1.4e-3}, [True, False, True]),
+        ({'miss': 2e-4}, [True, True, False]),
+    ],
+)
+def test_plan_is_compared_with_its_bound_and_its_insertion(
+    change: dict[str, float], verdicts: list[bool]
+) -> None:
+    """The plan has a clearance of 1.5 mm and a resolution of 0.5 mm."""
+    values = {'straight_bound': 1.8e-3, 'least': 1.5e-3, 'miss': 0.0} | change
+    plan = replace(bowed_plan(), straight_bound=values['straight_bound'])
+    checks = plan_checks(plan, values['least'], values['miss'])
+    assert [check.passed for check in checks] == verdicts
