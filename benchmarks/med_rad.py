@@ -31,7 +31,7 @@ _OBSTACLE: Final = re.compile(r'vessel|artery|vein|ventricle', re.IGNORECASE)
 _MARGIN, _AROUND = 2e-3, 20e-3  #: Margin of the obstacles, and radius around the start [m].
 
 
-class Pair(NamedTuple):
+class StartAndTarget(NamedTuple):
     """Start pose and target of a patient."""
 
     name: str
@@ -40,7 +40,7 @@ class Pair(NamedTuple):
     target: FloatArray  #: target [m], shape (3,)
 
 
-def pairs(folder: Path) -> Iterator[Pair]:
+def pairs(folder: Path) -> Iterator[StartAndTarget]:
     """Yield the pairs of the folder of a patient."""
     for file in sorted(folder.glob('*start*.txt')):
         pose = np.loadtxt(file)
@@ -51,7 +51,7 @@ def pairs(folder: Path) -> Iterator[Pair]:
         line = (end - start) / np.linalg.norm(end - start)
         along = abs(float(line @ pose[:3, 2]))
         slope = float(np.tan(np.arccos(min(1.0, along))))
-        yield Pair(f'{folder.parent.name} {folder.name} {file.stem}', start, slope, end)
+        yield StartAndTarget(f'{folder.parent.name} {folder.name} {file.stem}', start, slope, end)
 
 
 def anatomy_of(folder: Path) -> tuple[Anatomy, ...]:
@@ -65,7 +65,7 @@ def anatomy_of(folder: Path) -> tuple[Anatomy, ...]:
 
 
 def found(
-    anatomy: tuple[Anatomy, ...], pair: Pair, needle: Path, radius: float, *, bow: bool
+    anatomy: tuple[Anatomy, ...], pair: StartAndTarget, needle: Path, radius: float, *, bow: bool
 ) -> tuple[Plan | None, str]:
     """Return a plan from entry points within a radius [m], or the reason why there is none."""
     try:

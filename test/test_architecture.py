@@ -34,6 +34,7 @@ MAY_IMPORT = {
         'needle_dynamics',
         'needle_identification',
         'needle_insertion',
+        'needle_planning',
         'needle_ros',
     },
     'benchmarks': {
