@@ -305,7 +305,7 @@ zero = np.zeros((5, 2))
 depth = np.linspace(0.0, 0.1, 5)
 one = SteeringRecording(depth=depth, guide=zero, roll=zero[:, 0], tip=zero)
 for order in ORDERS:
-    SimulatedCauses(one, order).responses(0.04, 0.035, 0.0)
+    SimulatedCauses(one, order, (0.0,)).responses(0.04, 0.035, 0.0)
 for needle, steering, _ in NEEDLES.values():
     insert_batch(needle, steering, depth[np.newaxis])
 phantom = NeedleParameters.preset('phantom')
