@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Node `steering`: steer the tip to a target by motions of the guide."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import asdict
 import json
 import sys
@@ -26,6 +26,7 @@ from needle_ros import contract
 from needle_ros.base_node import steady_timer
 from needle_ros.errors import MessageError, ParameterError, printable
 from needle_ros.event_log import Severity
+from needle_ros.life_cycle_node import imports, PreparationProgress
 from needle_ros.publishers_node import Publishers
 from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.run_node import run
@@ -46,6 +47,7 @@ _WATCH = 0.05  #: Time between two checks for missing inputs, and for a plan tha
 _ACTION = 'trajectory_action'  #: Parameter with the action of a robot.
 _ARRIVAL = Duration(seconds=1.0)  #: Longest time until a motion is acknowledged, in lock-step.
 _PLAN = 'plan'  #: Parameter with the file of a plan.
+_OF_PLANS = ('needle_controller.steering.contact',)  #: Modules that a plan needs.
 _SELDOM = 10.0  #: Shortest time between two warnings of a record that cannot be written [s].
 
 
@@ -123,6 +125,12 @@ class SteeringNode(CompiledNode):
         self._moved = False  #: Whether a motion was sent since the last report.
 
     # Transitions.
+
+    def preparation(self) -> Iterable[PreparationProgress]:
+        """Import also the monitoring of the clearance, with a plan."""
+        yield from super().preparation()
+        if self.text(_PLAN):
+            yield from imports(_OF_PLANS)
 
     def configure(self) -> None:
         """Create the steering executive from the parameters."""

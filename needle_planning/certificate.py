@@ -13,7 +13,7 @@ from dataclasses import replace
 from math import ceil
 from typing import Final, NamedTuple
 
-from needle_controller.steering.insertion_plan import DIRECTIONS
+from needle_controller.steering.free_space import UNITS
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import inserted_shape, SteeredNeedle
@@ -159,9 +159,8 @@ def free_space(
     edges = np.linspace(0.0, depths[-1], count * _SAMPLES + 1)
     along = 0.5 * (edges[1:] + edges[:-1])
     middle = np.array([np.interp(along, depths, one) for one in path.T]).T
-    angles = np.linspace(0.0, 2.0 * np.pi, DIRECTIONS, endpoint=False)
-    units = np.outer(np.cos(angles), line.axes[0]) + np.outer(np.sin(angles), line.axes[2])
-    distance = np.zeros((len(along), DIRECTIONS))
+    units = UNITS @ line.axes[[0, 2]]
+    distance = np.zeros((len(along), len(units)))
     # Outwards by the clearance, which no obstacle is nearer than.
     active = np.ones(distance.shape, dtype=np.bool_)
     for _ in range(_TRIES):

@@ -7,9 +7,9 @@ reveals a part of the deviation, which the guide then corrects within its reach,
 
 .. math:: P_{contact} = E\left[ P(l + \mathrm{rest}(d) + e \notin F) \right],
 
-with the path l, the free space F of a place, the deviation d that will be revealed, what the guide
-cannot correct of it, and an error e as large as in one step. The needle behind the tip lies where
-the tip passed, shifted by the guide as in the nominal needle. The largest probability of all
+with the path l, the free space F of a place, the deviation d that will be revealed, its rest that
+the guide cannot correct, and an error e as large as in one step. The needle behind the tip lies
+where the tip passed, shifted by the guide as in the nominal needle. The largest probability of all
 places counts.
 """
 
@@ -69,7 +69,7 @@ class _Shaft(NamedTuple):
 
     places: FloatArray  #: depths [m], shape (m,)
     free: FloatArray  #: free distances [m], shape (m, 16)
-    off: FloatArray  #: deviation less the path of the plan [m], shape (m, 2)
+    off: FloatArray  #: deviation less the planned path [m], shape (m, 2)
     covariance: FloatArray  #: of the tip when it passed [m^2], shape (m, 2, 2)
     tips: FloatArray  #: tip of the nominal needle when it passed [m], shape (m, 2)
 
@@ -127,7 +127,7 @@ class MonitoredLaw:
         if not len(plan.free):
             raise ParameterError('contact.limit must be 1 for a plan without free space')
         self._places, self._free = plan.free[:, 0], plan.free[:, 1:]
-        #: Position of the path of the plan at the places, shape (m, 2) [m].
+        #: Planned path at the places, shape (m, 2) [m].
         self._centers = _between(self._places, plan.depths, plan.tip_path.tips)
         self._contact = _Contact(0.0, float(model.depths[0]))
         self._replanned = ''
@@ -205,7 +205,7 @@ class MonitoredLaw:
         later = np.diagonal(forecast.covariances - own, axis1=1, axis2=2)
         revealed = np.sqrt(np.maximum(later, 0.0))
         now, limits = forecast.guide[first], self._limits
-        # In each later step, as far as the guide comes until then.
+        # Largest motion of the guide from its present position to each later step.
         steps = np.arange(1, len(depths) - 1 - first)[:, np.newaxis]
         most = np.minimum(steps * limits.guide_step, limits.guide_limit - np.abs(now))
         reach = USED * np.abs(forecast.response[:, first + 1 :]) @ most
@@ -221,7 +221,7 @@ class MonitoredLaw:
                 weight = of_x.weight * of_z.weight
                 rest = np.column_stack([of_x.mean, of_z.mean])
                 spread = np.stack([of_x.variance, of_z.variance], axis=1)[:, np.newaxis]
-                # As many standard deviations away: no contribution.
+                # Places far from an obstacle do not contribute.
                 size = np.sqrt(spread.max(axis=(1, 2)) + np.trace(covariance, axis1=1, axis2=2))
                 gap = free.min(axis=1) - np.linalg.norm(base + rest, axis=1)
                 near = (weight > _NEGLIGIBLE) & (gap < _FAR * size)
@@ -310,7 +310,7 @@ def monitored(
 
 
 def _uncorrected(mean: FloatArray, deviation: FloatArray, reach: FloatArray) -> list[_Part]:
-    """Return what a guide with a reach cannot correct of a normal deviation: 0, +, -."""
+    """Return the rest of a normal deviation beyond the reach of the guide: zero, +, -."""
     size = np.maximum(deviation, sqrt(_LEAST))
     found = []
     for sign in (1.0, -1.0):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
@@ -24,6 +24,7 @@ from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.contract import Topic
 from needle_ros.errors import JobError, MessageError, printable
 from needle_ros.event_log import EventLog, Severity
+from needle_ros.life_cycle_node import imports, PreparationProgress
 from needle_ros.publishers_node import request_stamp
 from needle_ros.requests import PendingRequest, RequestStatus
 from needle_ros.run_node import run
@@ -44,6 +45,14 @@ _AT_ONCE: Final = 16  #: largest number of messages per reading
 _PACKAGE: Final = 'pyigtl'
 
 #: Name of the receiver of targets until a node has answered.
+#: Modules and kernels of plans.
+_OF_PLANS: Final = ('scipy.optimize', 'scipy.sparse', 'numba.core.boxing')
+_KERNELS: Final = (
+    'needle_planning.compiled.boxes',
+    'needle_dynamics.compiled.cut',
+    'needle_dynamics.compiled.cutting_needle',
+    'needle_dynamics.compiled.superposition',
+)
 _TAKER: Final = 'controller or steering'
 
 
@@ -88,6 +97,18 @@ class SlicerNode(BaseNode):
         self._sending: tuple[PendingRequest, PointStamped] | None = None
 
     # Transitions.
+
+    def preparation(self) -> Iterable[PreparationProgress]:
+        """Import and compile also the functions of plans, if there are labels."""
+        yield from super().preparation()
+        if not self.text('planning.labels'):
+            return
+        # It imports Numba.
+        from needle_dynamics.compiled.cache import prepare
+
+        yield from imports(_OF_PLANS)
+        for step in prepare(_KERNELS):
+            yield PreparationProgress(*step)
 
     def configure(self) -> None:
         if find_spec(_PACKAGE) is None:

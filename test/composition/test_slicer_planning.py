@@ -91,7 +91,8 @@ def test_plan_is_that_of_the_anatomy(labels: Path, tmp_path: Path) -> None:
         found = read_plan(output)
         # The matrix of the message has 24 bits: 6e-8 of 0.1 m.
         np.testing.assert_allclose(found.entry, expected.entry, atol=1e-7)
-        assert found.clearance == pytest.approx(expected.clearance, abs=1e-6)
+        # It changes by at most the change of the positions.
+        assert found.clearance == pytest.approx(expected.clearance, abs=1e-7)
         assert table.planner.shape is not None
         np.testing.assert_allclose(table.planner.shape.curve[-1], TARGET, atol=1e-3)
         assert table.lines[-1] == (Severity.INFO, state)

@@ -275,6 +275,16 @@ def test_needle_of_a_plan_is_sent_to_each_new_peer(room: Room, tmp_path: Path) -
         np.testing.assert_allclose(points.positions[-1], ends, atol=1e-4)
 
 
+def test_functions_of_plans_are_prepared_before_activation(
+    room: Room, planning: dict[str, Any]
+) -> None:
+    """And only with labels."""
+    for parameters, wanted in (({}, False), (planning, True)):
+        node = room.graph.add(SlicerNode, start=False, parameters=parameters)
+        steps = {step.step for step in node.preparation()}
+        assert ({'scipy.optimize', 'line_clearances'} <= steps) == wanted
+
+
 def test_segmentation_and_target_become_a_plan(room: Room, planning: dict[str, Any]) -> None:
     """Sent and written, by the node as a process; no target starts an insertion."""
     room.graph.start('slicer', {'port': room.port, **planning})

@@ -610,6 +610,18 @@ def test_insertion_along_a_plan(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert off[-1] < 5e-4
 
 
+def test_modules_of_a_plan_are_imported_before_activation(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
+    """And only with a plan."""
+    file = tmp_path / 'plan.yaml'
+    write_plan(bowed_plan(), file)
+    for value, wanted in (('', False), (str(file), True)):
+        node = ros_graph.add(SteeringNode, start=False, parameters={'plan': value})
+        steps = {step.step for step in node.preparation()}
+        assert ('needle_controller.steering.contact' in steps) == wanted
+
+
 @pytest.mark.requirement('S-316')
 @pytest.mark.parametrize('action', ['stop', 'retract'])
 def test_needle_stops_before_contact_along_a_plan(
@@ -632,7 +644,7 @@ def test_needle_stops_before_contact_along_a_plan(
     depths = [length - one.position[one.name.index('d')] for one in truth]
     assert max(depths) < 0.03
     if action == 'retract':
-        # `retract_depth`
+        # `retract_depth`; the needle rests within 0.3 mm of it, and the sample may be earlier.
         assert depths[-1] == pytest.approx(5e-3, abs=1e-3)
 
 
