@@ -25,6 +25,10 @@ PHANTOM = NeedleParameters.preset('phantom')
 #: without stalls is 0.15; at 200 Hz the other laws have 0.12 for a period after some stalls.
 OVERSHOOT = 0.2
 
+#: Velocity that a lost command adds when its force is held [m/s]: the acceleration limit of the
+#: reference over the timeout of the plant.
+HELD = 0.1 * 0.1
+
 #: Largest distance from the target at rest [m]: dry friction, 0.56 N, over the stiffness of PID.
 AT_REST = 1e-4
 
@@ -40,7 +44,7 @@ stalls = st.lists(
 )
 
 
-@pytest.mark.requirement('S-210', 'S-213', 'S-214', 'S-215')
+@pytest.mark.requirement('S-210', 'S-213', 'S-214', 'S-215', 'S-317')
 @pytest.mark.parametrize('kind', ['target', 'path'])
 @pytest.mark.parametrize('law', LAWS)
 @settings(max_examples=5)
@@ -48,13 +52,15 @@ stalls = st.lists(
 @example([Stall('plant', 0.3, 0.09), Stall('commands', 0.3, 0.6), Stall('controller', 0.3, 0.12)])
 # During the acceleration.
 @example([Stall('plant', 0.0625, 0.0625)])
+@example([Stall('commands', 0.0625, 0.09375)])
 def test_velocities_after_stalls_are_within_limits(
     law: str, kind: str, happens: Sequence[Stall]
 ) -> None:
     """Of the reference by its limit, of the needle with an overshoot; the target is reached."""
     found = insert(law, kind, happens, rate=RATE)
     assert found.reference <= LIMIT * (1.0 + 1e-9)
-    assert max(found.inward, found.outward) <= LIMIT * (1.0 + OVERSHOOT)
+    held = HELD if any(one.victim == 'commands' for one in happens) else 0.0
+    assert max(found.inward, found.outward) <= LIMIT * (1.0 + OVERSHOOT) + held
     assert found.stop == ''
     assert abs(found.depth - TARGET) < AT_REST
 
@@ -142,7 +148,7 @@ def test_lost_commands_do_not_make_the_needle_faster(law: str) -> None:
     assert abs(found.depth - TARGET) < AT_REST
 
 
-@pytest.mark.requirement('S-284')
+@pytest.mark.requirement('S-318')
 @given(st.floats(-2.0, 2.0), st.floats(0.5, 2.0), st.floats(0.0, 1.0))
 @example(0.0, 1.0, 0.0)
 @settings(max_examples=20, deadline=None)
