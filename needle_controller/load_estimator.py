@@ -13,7 +13,8 @@ from needle_ros.status import ObserverStatus
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
-_CHECK_INTERVAL: Final = 25  #: Samples between two consistency checks of the observer.
+CHECK_INTERVAL: Final = 25  #: Samples between two consistency checks of the observer.
+WARM_UP: Final = 1.2  #: Time after the start without a check, as a multiple of the history.
 
 
 def build_observer(
@@ -113,7 +114,7 @@ class LoadEstimator:
         self.load = 0.0
         observer.update(stamp, measured.depth, measured.velocity, own)
         self._updates += 1
-        if self._updates % _CHECK_INTERVAL == 0:
+        if self._updates % CHECK_INTERVAL == 0:
             self._check_consistency(observer)
         load = observer.load
         if not abs(load) <= self._largest:
@@ -124,7 +125,7 @@ class LoadEstimator:
 
     def _check_consistency(self, observer: Observer) -> None:
         # The initial state is a guess, and affects the NIS while the history contains it.
-        known = self._updates * observer.period > 1.2 * observer.settings.history
+        known = self._updates * observer.period > WARM_UP * observer.settings.history
         nis = observer.nis
         self.warning = None
         if known and nis.doubtful:

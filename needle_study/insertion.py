@@ -8,8 +8,11 @@ from typing import Any, Final, NamedTuple
 
 import needle_controller as control
 from needle_controller.controller import LAW_OF
+from needle_controller.in_loop.observed import TipObserver
 from needle_controller.in_loop.sampled import motion_of, run_insertions
 from needle_controller.laws.law import Law, require_complete
+from needle_controller.observer.observer import check_period
+from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.safety import Guard
 from needle_controller.stability import Uncertainty
 from needle_dynamics import find_needle, FloatArray, NeedleModel, NeedleParameters, simulate_batch
@@ -30,7 +33,13 @@ _MOST: Final = 1_000_000  #: most samples of an insertion
 _AT_ONCE: Final = 32  #: insertions per batch, whose samples are all in memory
 
 #: Settings that are mappings or words.
-_PARTS: Final = ('needle', 'constants', 'controller', 'gains', 'uncertainty', 'reference')
+_PARTS: Final = (
+    'needle', 'constants', 'controller', 'gains', 'uncertainty', 'reference', 'observer'
+)  # fmt: skip
+#: Settings of the observer without those of the wrench, and of a tip sensor with exposure.
+_OBSERVER: Final = (
+    'irregularity', 'initial_deflection', 'tip_force', 'tip_force_time', 'tip_noise', 'history'
+)  # fmt: skip
 
 METRICS: Final[Mapping[str, Metric]] = {
     'error': Metric('m', 'distance of the needle from the target depth at the end'),
@@ -67,15 +76,16 @@ class _Insertion(NamedTuple):
     motion: FloatArray
     commands: FloatArray  #: command of each sample [N], shape (k,)
     forces: FloatArray  #: force that acts from each sample on [N], shape (k,)
-    noise: FloatArray  #: encoder errors of depth [m] and velocity [m/s], shape (k, 2)
+    #: Errors of measured depth [m], velocity [m/s] and tip deflection [m], shape (k, 3).
+    noise: FloatArray
     goal: FloatArray  #: reference [m], shape (k + 1,); NaN without a reference
     stopped: float  #: as in `METRICS`
     left: float
 
     @property
     def measured(self) -> FloatArray:
-        """Measured depth [m] and velocity [m/s], shape (2, k + 1); the last is exact."""
-        found = self.motion[:2].copy()
+        """Measured depth [m], velocity [m/s] and deflection [m], (3, k + 1); the last is exact."""
+        found = self.motion.copy()
         count = min(len(self.noise), found.shape[1])
         found[:, :count] += self.noise[:count].T
         return found
@@ -93,7 +103,7 @@ class InsertionScenario(Scenario):
 
     `settings` holds ``needle``, as `find_needle`; nominal ``constants``; ``controller`` of
     `CONTROLLERS` with ``gains`` that are stable for the ``uncertainty``; ``reference`` of
-    `REFERENCES`; and the fields of `InsertionStudy`.
+    `REFERENCES`; ``observer``, true or some of its settings; and the fields of `InsertionStudy`.
     """
 
     metrics, at_once = METRICS, _AT_ONCE
@@ -126,6 +136,7 @@ class InsertionScenario(Scenario):
         )
         plants = from_values(Uncertainty, uncertainty, 'settings.uncertainty.')
         self._law = self._made(words['controller'], gains, plants)
+        self._observer = self._observed(settings.get('observer', False))
         p, numbers = self._needle, self._numbers
         # Upper bound of the duration of an insertion.
         if self._law is None:
@@ -165,6 +176,30 @@ class InsertionScenario(Scenario):
                 0.0, 100.0,
             ),
         }  # fmt: skip
+        if self._observer is not None:
+            usual = ObserverSettings().tip_noise
+            self.variables = {
+                **self.variables,
+                'tip_noise': Variable(
+                    usual, 'm', 'standard deviation of a measured tip deflection', 0.0
+                ),
+            }
+
+    def _observed(self, given: Any) -> TipObserver | None:
+        """Return the observer of the law; none for false."""
+        if given is False:
+            return None
+        if self._law is None:
+            raise ParameterError(f'settings: observer is for {", ".join(control.LAWS)}')
+        chosen = {} if given is True else scenario.mapping('settings: observer', given)
+        scenario.check_names('settings: observer: ', chosen, _OBSERVER)
+        own = from_values(ObserverSettings, chosen, 'settings.observer.')
+        found = TipObserver(self._needle, own, self._period, self._limits.axial_load)
+        try:
+            check_period(own, self._period)
+        except ParameterError as error:
+            raise ParameterError(f'settings: observer: {error}') from error
+        return found
 
     def _made(
         self, controller: str, gains: Mapping[str, Any], uncertainty: Uncertainty
@@ -200,10 +235,10 @@ class InsertionScenario(Scenario):
         (run,) = self._simulate([row], [rng])
         yield MeasuredRun(contract.TARGET, 0, (0.0, row['target'], 0.0))
         # The effort acted up to the sample.
-        joints = np.stack([*run.measured, np.concatenate([[0.0], run.forces])], axis=1)
-        for k, (depth, _, tip) in enumerate(run.motion.T.tolist()):
+        columns = [run.motion[0], *run.measured, np.concatenate([[0.0], run.forces])]
+        for k, row_of in enumerate(np.stack(columns, axis=1).tolist()):
             stamp = round(k * self._period * NANOSECONDS)
-            position, velocity, effort = joints[k].tolist()
+            depth, position, velocity, tip, effort = row_of
             values = (position, 0.0, velocity, 0.0, effort, 0.0)
             yield MeasuredRun(contract.JOINT_STATES, stamp, values)
             at = (0.0, depth, tip)
@@ -229,9 +264,13 @@ class InsertionScenario(Scenario):
         return self._closed(law, rows, streams)
 
     def _noise(self, row: Row, rng: np.random.Generator, count: int) -> FloatArray:
-        """Return the noise of depth, velocity and force for each period, shape (count, 3)."""
+        """Return the noise of depth, velocity, force and tip for each period, (count, 4)."""
         sizes = [row[name] for name in ('depth_noise', 'velocity_noise', 'force_noise')]
-        return np.asarray(sizes * rng.standard_normal((count, 3)))
+        noise = np.zeros((count, 4))
+        noise[:, :3] = sizes * rng.standard_normal((count, 3))
+        if 'tip_noise' in row:
+            noise[:, 3] = row['tip_noise'] * rng.standard_normal(count)
+        return noise
 
     def _closed(self, law: Law, rows: Sequence[Row], streams: Streams) -> Iterator[_Insertion]:
         numbers, models, references, noises = self._numbers, [], [], []
@@ -258,11 +297,12 @@ class InsertionScenario(Scenario):
             delay=delay,
             limit=numbers.force_limit,
             step=numbers.step,
+            observer=self._observer,
         )
         for noise, late, one in zip(noises, lates, found, strict=True):
             acting = np.concatenate([np.zeros(delay + late), one.commands])[: len(noise)]
             run = _Insertion(
-                one.motion, one.commands, acting + noise[:, 2], noise[:, :2], one.goal, 0.0,
+                one.motion, one.commands, acting + noise[:, 2], noise[:, [0, 1, 3]], one.goal, 0.0,
                 float(one.completed < len(noise)),
             ).until(one.completed)  # fmt: skip
             end = self._stop(run)
@@ -270,8 +310,8 @@ class InsertionScenario(Scenario):
 
     def _stop(self, run: _Insertion) -> int | None:
         """Return the sample of the stop by the guard, or None."""
-        depth, velocity = run.measured
-        samples = (depth, velocity, run.goal - depth, run.motion[2])
+        depth, velocity, tip = run.measured
+        samples = (depth, velocity, run.goal - depth, tip)
         # Limits are intervals: nearly always the extremes are within them, and so all samples.
         extremes = [(one.min(), one.min(), one.max(), one.max()) for one in samples]
         if self._violated(np.transpose(extremes)) is None:
@@ -316,7 +356,7 @@ class InsertionScenario(Scenario):
             count = len(pushes)
             done = min(round(batch.completed[k] * numbers.rate), count)
             yield _Insertion(
-                motion_of(model, batch.states[k]), pushes, forces[k], blur[:, :2],
+                motion_of(model, batch.states[k]), pushes, forces[k], blur[:, [0, 1, 3]],
                 np.full(count + 1, nan), nan, float(done < count),
             ).until(done)  # fmt: skip
 

@@ -104,9 +104,9 @@ def _growth(needle: CompiledNeedle, time: float) -> float:
 
 
 @kernel
-def begin(boxed: Boxed[Filter], time: float, span: float, depth: float) -> None:
+def begin(boxed: Boxed[Filter], slot: int, time: float, span: float, depth: float) -> None:
     """
-    Write the prior state at a time [s] and insertion depth [m] into the first slot.
+    Write the prior state at a time [s] and insertion depth [m] into a slot.
 
     All c and b have the same variance, such that the tip has its prior variance. The prior of the
     low-pass memory is a constant and a white wrench of the size that such a needle exerts.
@@ -114,7 +114,7 @@ def begin(boxed: Boxed[Filter], time: float, span: float, depth: float) -> None:
     f = boxed.value
     needle, low_pass = f.needle, f.low_pass
     n, filters = f.squares.shape[1], low_pass.steady.shape[0]
-    frozen = freeze(needle, depth, _growth(needle, time), _modes(f, 0))
+    frozen = freeze(needle, depth, _growth(needle, time), _modes(f, slot))
     impulse = np.empty((2, 2 * n))
     base_impulse(needle, frozen, 0.0, impulse)
     share = 0.0
@@ -124,11 +124,11 @@ def begin(boxed: Boxed[Filter], time: float, span: float, depth: float) -> None:
             tip += frozen.at.value[i] * frozen.modes.shapes[i, k]
         share += tip * tip / frozen.modes.squares[k]
     variance = f.noise.prior / share
-    sample = f.samples[0]
+    sample = f.samples[slot]
     sample['time'], sample['depth'], sample['growth'] = time, depth, frozen.growth
     sample['nis'] = sample['degrees'] = 0.0
-    f.states[0] = 0.0
-    covariance = f.covariances[0]
+    f.states[slot] = 0.0
+    covariance = f.covariances[slot]
     covariance[:] = 0.0
     for i in range(2 * n):
         covariance[i, i] = variance
@@ -323,7 +323,9 @@ def observe(
     new: int,
     time: float,
     span: float,
+    before: float,
     depth: float,
+    rate: float,
     velocity: float,
     lateral: float,
     moment: float,
@@ -331,19 +333,24 @@ def observe(
     """
     Process one sample into the slot ``new``, after the slot ``old``.
 
-    ``count`` is the number of valid exposures, ``depth`` [m] and ``velocity`` [m/s] are means over
-    the sample, ``lateral`` [N] and ``moment`` [N m] the readings of the wrench, NaN if missing.
+    ``count`` is the number of valid exposures. Over the sample the insertion depth changes from
+    ``before`` to ``depth`` [m], with velocities ``rate`` and ``velocity`` [m/s]. ``lateral`` [N]
+    and ``moment`` [N m] are the readings of the wrench, NaN if missing.
     """
+    # Mean of the cubic through both ends, limited to their range.
+    mean = before + 0.5 * (depth - before) + span * (rate - velocity) / 12.0
+    depth = min(max(mean, min(before, depth)), max(before, depth))
+    velocity = 0.5 * (rate + velocity)
     f = boxed.value
     n = f.squares.shape[1]
-    before, sample, change = f.samples[old], f.samples[new], f.changes[new]
+    last, sample, change = f.samples[old], f.samples[new], f.changes[new]
     growth = _growth(f.needle, time)
     sample['time'], sample['span'] = time, span
     sample['depth'], sample['growth'] = depth, growth
     sample['lateral'], sample['moment'] = lateral, moment
     frozen = freeze(f.needle, depth, growth, _modes(f, new))
     change_basis(_modes(f, old), frozen.modes, -0.5 * span, 0.5 * span, change)
-    if depth == before['depth'] and growth == before['growth']:
+    if depth == last['depth'] and growth == last['growth']:
         # No accumulation of rounding while the needle rests.
         for i in range(2 * n):
             for k in range(2 * n):
@@ -369,8 +376,54 @@ def replay(boxed: Boxed[Filter], count: int, oldest: int, newest: int, since: fl
         slot = following
 
 
+@inlined
+def _present(
+    f: Filter, slot: int, depth: float, span: float, change: FloatArray, now: FloatArray
+) -> Frozen:
+    """Write c and b of the modes at the present depth, and their derivatives by the slot."""
+    n = f.squares.shape[1]
+    frozen = freeze(f.needle, depth, f.samples[slot]['growth'], empty_normal_modes(n))
+    change_basis(_modes(f, slot), frozen.modes, -0.5 * span, 0.0, change)
+    for i in range(2 * n):
+        now[i] = 0.0
+        for k in range(2 * n):
+            now[i] += change[i, k] * f.states[slot, k]
+    return frozen
+
+
+@inlined
+def _load(needle: CompiledNeedle, frozen: Frozen, now: FloatArray, span: float) -> float:
+    """
+    Return the force of the bent needle against insertion [N].
+
+    By the modes below half the sample rate: the estimated rates of faster modes are noise, which
+    their square would add to the force.
+    """
+    at, modes = frozen.at, frozen.modes
+    n = modes.squares.shape[0]
+    bend, tip, rate = 0.0, 0.0, 0.0
+    for j in range(n):
+        omega = sqrt(modes.squares[j])
+        if omega * span < pi:
+            for i in range(n):
+                bend += at.curvature[i] * modes.shapes[i, j] * now[j] / omega
+                tip += at.value[i] * modes.shapes[i, j] * now[j] / omega
+                rate += at.value[i] * modes.shapes[i, j] * now[n + j]
+    density, stiffness = needle.linear_density, frozen.stiffness
+    return coupling(density, needle.bending_stiffness, stiffness, bend, tip, rate)
+
+
+@compiled
+def present_load(boxed: Boxed[Filter], slot: int, depth: float, span: float) -> float:
+    """Return the force of the bent needle against insertion [N] as `estimate`."""
+    f = boxed.value
+    modal = 2 * f.squares.shape[1]
+    change, now = np.empty((modal, modal)), np.empty(modal)
+    return _load(f.needle, _present(f, slot, depth, span, change, now), now, span)
+
+
 @kernel
-def estimate(  # noqa: C901
+def estimate(
     boxed: Boxed[Filter], slot: int, depth: float, span: float, modal: Vector, jacobian: Matrix
 ) -> tuple[float, float, float]:
     """
@@ -378,21 +431,16 @@ def estimate(  # noqa: C901
 
     ``modal``, shape (2 n,), takes q [m^3/2] and q_dot [m^3/2 / s], ``jacobian``, shape (2 n, 2 n),
     their derivatives by c and b of the slot. Returns the tip deflection and its standard deviation
-    [m], and the force of the bent needle against insertion [N] by the modes below half the sample
-    rate: the estimated rates of faster modes are noise, which their square would add to the force.
+    [m], and the force of the bent needle against insertion [N].
     """
     f = boxed.value
-    needle, x, covariance = f.needle, f.states[slot], f.covariances[slot]
+    needle, covariance = f.needle, f.covariances[slot]
     n = f.squares.shape[1]
-    frozen = freeze(needle, depth, f.samples[slot]['growth'], empty_normal_modes(n))
+    change, now = np.empty((2 * n, 2 * n)), np.empty(2 * n)
+    frozen = _present(f, slot, depth, span, change, now)
     at, modes = frozen.at, frozen.modes
-    change, now = np.empty((2 * n, 2 * n)), np.zeros(2 * n)
-    change_basis(_modes(f, slot), modes, -0.5 * span, 0.0, change)
-    for i in range(2 * n):
-        modal[i] = 0.0
-        for k in range(2 * n):
-            now[i] += change[i, k] * x[k]
-            jacobian[i, k] = 0.0
+    modal[:] = 0.0
+    jacobian[:] = 0.0
     for i in range(n):
         for j in range(n):
             shape, omega = modes.shapes[i, j], sqrt(modes.squares[j])
@@ -410,15 +458,5 @@ def estimate(  # noqa: C901
     for i in range(2 * n):
         for k in range(2 * n):
             variance += row[i] * covariance[i, k] * row[k]
-    spread = sqrt(max(variance, 0.0))
-    bend, tip, rate = 0.0, 0.0, 0.0
-    for j in range(n):
-        omega = sqrt(modes.squares[j])
-        if omega * span < pi:
-            for i in range(n):
-                bend += at.curvature[i] * modes.shapes[i, j] * now[j] / omega
-                tip += at.value[i] * modes.shapes[i, j] * now[j] / omega
-                rate += at.value[i] * modes.shapes[i, j] * now[n + j]
-    density, stiffness = needle.linear_density, frozen.stiffness
-    load = coupling(density, needle.bending_stiffness, stiffness, bend, tip, rate)
-    return deflection, spread, load
+    load = _load(needle, frozen, now, span)
+    return deflection, sqrt(max(variance, 0.0)), load

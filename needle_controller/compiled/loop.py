@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Closed loop of a sampled law and the simulated needle, for batches of runs."""
 
-from typing import NamedTuple
+from __future__ import annotations
 
+from typing import NamedTuple, TYPE_CHECKING
+
+from needle_controller.compiled.filter import Filter
 from needle_controller.compiled.laws import (
     adapt,
     answer,
@@ -12,6 +15,7 @@ from needle_controller.compiled.laws import (
     LawTuple,
     MEMORY,
 )
+from needle_controller.compiled.loop_observer import LoopObserver, observed_load
 from needle_dynamics.arrays import (
     Array3,
     BoolArray,
@@ -23,6 +27,7 @@ from needle_dynamics.arrays import (
 )
 from needle_dynamics.compiled.cache import inlined, kernel
 from needle_dynamics.compiled.friction import friction_flow, FrictionConstants
+from needle_dynamics.compiled.integrals import tip_deflections
 from needle_dynamics.compiled.lane_rows import (
     ACCELERATION,
     DEPTH,
@@ -45,6 +50,9 @@ from needle_dynamics.compiled.lanes import (
 )
 from needle_dynamics.compiled.step import adapted, advance, CompiledNeedle, Inputs
 import numpy as np
+
+if TYPE_CHECKING:
+    from needle_dynamics.compiled.boxed import Boxed
 
 
 @inlined
@@ -84,6 +92,8 @@ def run_loop(
     noise: Matrix,
     added: Matrix,
     longest: float,
+    observer: LoopObserver,
+    boxed: Boxed[Filter],
     depths: Vector,
     states: Matrix,
     commands: Vector,
@@ -101,14 +111,17 @@ def run_loop(
     last setpoint the reference waits, as in `ReferenceHold`. ``pending``, shape (delay,), are
     commands without effect so far, updated, of which the law compensates the newest ``known``.
     ``noise``, shape (k, 3) or (0, 3), has errors of measured position and velocity, and additional
-    force. ``added``, shape (m, 3), has depths above which Coulomb and viscous friction [N s/m] are
-    added, until the next row. ``longest`` is the longest step [s].
+    force; with an observer, whose load the law compensates from the next period on, a fourth
+    column has errors of the measured tip deflection. ``added``, shape (m, 3), has depths above
+    which Coulomb and viscous friction [N s/m] are added, until the next row. ``longest`` is the
+    longest step [s].
 
     Outputs, the first three unused if empty: at the measurements ``depths``, shape (k + 1,), and
     ``states``, shape (k + 1, 2 (2 + n)); ``commands``, shape (k,); ``errors``, shape (3,), goal
     without waits minus insertion depth: last, largest in modulus, and mean square [m^2].
     """
-    memory, none = np.zeros(MEMORY), np.empty((0, 3))
+    memory, none, load = np.zeros(MEMORY), np.empty((0, 3)), 0.0
+    observer.memory[:] = 0.0
     period, m = LawConstants(*law).period, state.shape[0] // 2
     count = setpoints.shape[0]
     largest, squares, acts, waited = 0.0, 0.0, 0.0, 0
@@ -129,7 +142,10 @@ def run_loop(
         at = k - waited
         instant = (depth, velocity, setpoints[at, 0], setpoints[at, 1], setpoints[at, 2])
         late = pending.shape[0] - known
-        command = answer(law, memory, pending[late:], instant, acts, 0.0, limit, np.nan)
+        if observer.memory.shape[0] > 0:
+            tip = tip_deflections(c.modes, state.reshape(1, -1))[0] + noise[k, 3]
+            load = observed_load(boxed, observer, 0, k * period, period, depth, velocity, tip)
+        command = answer(law, memory, pending[late:], instant, acts, load, limit, np.nan)
         waited += _waits(command, limit, setpoints[count - 1, 0] - goal[at])
         # Force of this period according to the law.
         acts = pending[late] if known > 0 else command
@@ -168,6 +184,7 @@ class LaneLoop(NamedTuple):
     known: int
     noise: Array3
     longest: float
+    observer: LoopObserver  #: an observer for each row in `which`, or none
     which: IntVector  #: rows of the runs to compute, at most one for each lane
     starts: Matrix  #: initial states
     #: Results: insertion depth, velocity and tip deflection at the measurements, shape
@@ -178,13 +195,14 @@ class LaneLoop(NamedTuple):
 
 
 @inlined
-def run_lanes_with(rotate: Rotation, loop: LaneLoop) -> None:
+def run_lanes_with(rotate: Rotation, loop: LaneLoop, boxed: Boxed[Filter]) -> None:
     """Run a law with needles in lanes as `run_loop`; ``rotate`` advances their modes."""
     needles, modes, layers, law, limit, setpoints, goal, counts, delays = loop[:9]
-    known, noise, longest, which, starts, motions, commands, completed = loop[9:]
+    known, noise, longest, observer, which, starts, motions, commands, completed = loop[9:]
     n, period = len(which), LawConstants(*law).period
     w, memory, acts = empty_lanes(modes), np.zeros((n, MEMORY)), np.zeros(n)
     waited, inside = np.zeros(n, dtype=np.int64), np.ones(n, dtype=np.bool_)
+    observer.memory[:] = 0.0
     # Lanes change places; the run of each.
     order = np.arange(n)
     for i in range(n):
@@ -200,11 +218,14 @@ def run_lanes_with(rotate: Rotation, loop: LaneLoop) -> None:
             run, at = which[own], k - waited[own]
             # As `answer`: arrays of pending commands would take longer than the law.
             depth, velocity = w[DEPTH + i] + noise[run, k, 0], w[VELOCITY + i] + noise[run, k, 1]
-            adapt(law, memory[own], depth, velocity, acts[own])
+            tip, now = motions[run, 2, k] + noise[run, k, 3], k * period
+            load = observed_load(boxed, observer, own, now, period, depth, velocity, tip)
+            adapt(law, memory[own], depth, velocity, acts[own] - load)
             for late in range(known, 0, -1):
-                depth, velocity = axis_step(law, depth, velocity, _past(commands, run, k - late))
+                force = _past(commands, run, k - late) - load
+                depth, velocity = axis_step(law, depth, velocity, force)
             aim = setpoints[run, at, 0], setpoints[run, at, 1], setpoints[run, at, 2]
-            command = law_step(law, memory[own], (depth, velocity, *aim), 0.0, limit)
+            command = law_step(law, memory[own], (depth, velocity, *aim), load, limit)
             commands[run, k] = command
             to_go = setpoints[run, counts[run] - 1, 0] - goal[run, at]
             waited[own] += _waits(command, limit, to_go)
@@ -227,9 +248,9 @@ def run_lanes_with(rotate: Rotation, loop: LaneLoop) -> None:
 
 
 @kernel
-def run_lanes(loop: LaneLoop) -> None:
+def run_lanes(loop: LaneLoop, boxed: Boxed[Filter]) -> None:
     """Run `run_lanes_with` for needles with one or two modes."""
-    run_lanes_with(rotate_two_lanes, loop)
+    run_lanes_with(rotate_two_lanes, loop, boxed)
 
 
 @inlined

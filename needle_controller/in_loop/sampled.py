@@ -12,6 +12,7 @@ from typing import Final, NamedTuple, Protocol
 from needle_controller.compiled.loop import LaneLoop, run_lanes, run_loop
 from needle_controller.compiled.many_loop import run_many_lanes
 from needle_controller.controller import ControllerOutput, Measurement
+from needle_controller.in_loop.observed import compiled_observer, no_observer, TipObserver
 from needle_controller.in_loop.run import LoopRun
 from needle_controller.laws.law import Law
 from needle_controller.reference.path import Trapezoid
@@ -259,13 +260,15 @@ def run_batch(
     trajectories = np.full((runs, count + 1 if record else 0, ends.shape[1]), np.nan)
     commands = np.full((runs, count if record else 0), np.nan)
 
+    none, boxed = no_observer()
+
     def run(share: range, advance: Callable[[], object]) -> None:
         for i in share:
             law = each_law[i % len(each_law)]
             completed[i] = run_loop(
                 needles[i % len(needles)], ends[i], law.packed, float(limit), setpoints,
-                goal, np.zeros(delay + late), delay, blurred, along, float(step), depths[i],
-                trajectories[i], commands[i], errors[i],
+                goal, np.zeros(delay + late), delay, blurred, along, float(step), none, boxed,
+                depths[i], trajectories[i], commands[i], errors[i],
             )  # fmt: skip
             advance()
 
@@ -303,11 +306,14 @@ def run_insertions(
     delay: int,
     limit: float,
     step: float,
+    observer: TipObserver | None = None,
 ) -> list[LoopInsertion]:
     """
     Run a law on needles, each with its own reference, noise and additional delay, on one core.
 
-    Arguments are as of `run_batch`, and a run has as many periods as its noise, shape (k, 3).
+    Arguments are as of `run_batch`, and a run has as many periods as its noise, shape (k, 3). With
+    an observer, the law compensates its load, and a fourth column of the noise has the errors of
+    the measured tip deflection [m].
     Several needles of the same reach that `simulate_batch` computes together are computed with
     each instruction; they differ from `run_batch` by rounding.
     """
@@ -317,7 +323,8 @@ def run_insertions(
     runs, most = len(order), int(counts[order[0]])
     counts, delays = counts[order], delay + np.array(lates)[order]
     chosen = [models[i] for i in order]
-    setpoints, blurred = np.zeros((2, runs, most, 3))
+    setpoints, blurred = np.zeros((runs, most, 3)), np.zeros((runs, most, 4))
+    watch, boxed = no_observer() if observer is None else compiled_observer(observer)
     goal, commands = np.full((runs, most + 1), np.nan), np.full((runs, most), np.nan)
     starts, motions = np.array([states[i] for i in order]), np.full((runs, 3, most + 1), np.nan)
     wide = lane_states(starts)
@@ -325,7 +332,7 @@ def run_insertions(
         count = counts[k]
         motion = _setpoints(references[i], law.period, count + delay + 1)
         setpoints[k, :count], goal[k, : count + 1] = motion[delay:-1], motion[: count + 1, 0]
-        blurred[k, :count] = noises[i]
+        blurred[k, :count, : noises[i].shape[1]] = noises[i]
     completed = np.zeros(runs)
     parameters = [model.parameters for model in chosen]
     layers, modes = lane_layers(parameters), parameters[0].modes
@@ -333,18 +340,19 @@ def run_insertions(
         if reach is not None:
             for part in np.split(some, range(LANES, len(some), LANES)):
                 advance = run_many_lanes if modes > 2 else run_lanes
-                advance(LaneLoop(
+                loop = LaneLoop(
                     lane_constants(parameters), lane_modes(reach, modes), layers, law.packed,
-                    float(limit), setpoints, goal, counts, delays, delay, blurred, step, part,
-                    wide, motions, commands, completed,
-                ))  # fmt: skip
+                    float(limit), setpoints, goal, counts, delays, delay, blurred, step, watch,
+                    part, wide, motions, commands, completed,
+                )  # fmt: skip
+                advance(loop, boxed)
             continue
         for k in some.tolist():
             n, model = counts[k], chosen[k]
             trajectory = np.full((n + 1, starts.shape[1]), np.nan)
             completed[k] = run_loop(
                 model.compiled, starts[k], law.packed, limit, setpoints[k, :n], goal[k, : n + 1],
-                np.zeros(delays[k]), delay, blurred[k, :n], _NONE, step, np.empty(0),
+                np.zeros(delays[k]), delay, blurred[k, :n], _NONE, step, watch, boxed, np.empty(0),
                 trajectory, commands[k, :n], np.empty(3),
             )  # fmt: skip
             motions[k, :, : n + 1] = motion_of(model, trajectory)

@@ -51,8 +51,8 @@ _LARGEST: Final = 1e6  #: Largest plausible measurement; squares of larger ones 
 
 
 @lru_cache(maxsize=64)
-def _far(degrees: int) -> float:
-    """Return the ratio that is exceeded by chance with a probability of 1e-6."""
+def largest_mean(degrees: int) -> float:
+    """Return the mean NIS that is exceeded by chance with a probability of 1e-6."""
     return float(chdtri(degrees, 1e-6)) / degrees
 
 
@@ -76,7 +76,7 @@ class Consistency:
     @property
     def doubtful(self) -> bool:
         """Whether the ratio is too large, by chance with a probability of 1e-6."""
-        return self.degrees > 0 and self.ratio > _far(self.degrees)
+        return self.degrees > 0 and self.ratio > largest_mean(self.degrees)
 
     @property
     def holds(self) -> bool:
@@ -123,10 +123,7 @@ class Observer:
         self, parameters: NeedleParameters, settings: ObserverSettings, period: float
     ) -> None:
         require_complete(parameters)
-        if not 0.0 < period < settings.history:
-            raise ParameterError(
-                f'period must be > 0 and < history = {settings.history:g} s, got {period!r}'
-            )
+        check_period(settings, period)
         ticks = round(settings.filter_rate * period)
         if ticks < 1 or abs(ticks - settings.filter_rate * period) > _NEAR * ticks:
             raise ParameterError(
@@ -135,25 +132,9 @@ class Observer:
             )
         settings = replace(settings, filter_rate=ticks / period)
         self.period, self.settings = float(period), settings
-        self.model, n = NeedleModel(parameters), parameters.modes
-        low_pass = settings.low_pass(ticks)
-        size = 2 * n + LOADS + 2 * len(low_pass.steady) + 1
+        self.model = NeedleModel(parameters)
         slots = ceil(settings.history / period) + 2
-        self._filter = Filter(
-            needle=self.model.compiled,
-            noise=settings.noise(),
-            low_pass=low_pass,
-            samples=np.zeros(slots, SAMPLE),
-            states=np.zeros((slots, size)),
-            covariances=np.zeros((slots, size, size)),
-            transitions=np.zeros((slots, size, size)),
-            shapes=np.zeros((slots, n, n)),
-            inverses=np.zeros((slots, n, n)),
-            squares=np.zeros((slots, n)),
-            tips=np.zeros((slots, n)),
-            changes=np.zeros((slots, 2 * n, 2 * n)),
-            exposures=np.zeros((2 * slots, 3)),
-        )
+        self._filter = empty_filter(self.model, settings, ticks, slots, 2 * slots)
         from needle_dynamics.compiled.boxed import Boxed
 
         self._boxed = Boxed(self._filter)
@@ -227,7 +208,7 @@ class Observer:
                 self._restart(f'depth jumped from {last.depth:g} to {sample.depth:g} m')
         if self._last is None:
             self._slot = self._oldest = self._count = 0
-            begin(self._boxed, time, self.period, sample.depth)
+            begin(self._boxed, 0, time, self.period, sample.depth)
         else:
             lateral, moment = wrench or (nan, nan)
             self._advance(self._last, sample, _finite(lateral), _finite(moment))
@@ -317,20 +298,16 @@ class Observer:
         span = elapsed / count
         if abs(span - period) < _EVEN * period:
             span = period
+        rate = advance / elapsed
         for k in range(1, count):
-            middle = before + advance * (k - 0.5) / count
-            self._step(start + elapsed * k / count, span, middle, advance / elapsed, nan, nan)
-        if count == 1:
-            # Mean of the cubic through both ends, limited to their range.
-            mean = before + 0.5 * advance + span * (last.velocity - velocity) / 12.0
-            mean = min(max(mean, min(before, depth)), max(before, depth))
-            velocity = 0.5 * (last.velocity + velocity)
-        else:
-            mean, velocity = depth - 0.5 * advance / count, advance / elapsed
-        self._step(time, span, mean, velocity, lateral, moment)
+            ends = before + advance * (k - 1) / count, before + advance * k / count
+            self._step(start + elapsed * k / count, span, *ends, rate, rate, nan, nan)
+        rates = (last.velocity, velocity) if count == 1 else (rate, rate)
+        ends = before + advance * (count - 1) / count, depth
+        self._step(time, span, *ends, *rates, lateral, moment)
 
     def _step(self, *sample: float) -> None:
-        """Process time, span, mean depth, mean velocity, and the wrench, in a new slot."""
+        """Process a sample, as `observe` from its time on, in a new slot."""
         old, slots = self._slot, len(self._filter.samples)
         self._slot = (old + 1) % slots
         if self._slot == self._oldest:
@@ -417,6 +394,37 @@ class Observer:
     def _normal_covariance(self) -> FloatArray:
         modal = 2 * self.model.modes.count
         return self._filter.covariances[self._slot, :modal, :modal]
+
+
+def check_period(settings: ObserverSettings, period: float) -> None:
+    """Raise `ParameterError` if the history is not longer than the sample period [s]."""
+    if not 0.0 < period < settings.history:
+        raise ParameterError(
+            f'period must be > 0 and < history = {settings.history:g} s, got {period!r}'
+        )
+
+
+def empty_filter(
+    model: NeedleModel, settings: ObserverSettings, ticks: int, slots: int, exposures: int
+) -> Filter:
+    """Return a filter; ``ticks`` is the number of samples of the force sensor in its sample."""
+    low_pass, n = settings.low_pass(ticks), model.modes.count
+    size = 2 * n + LOADS + 2 * len(low_pass.steady) + 1
+    return Filter(
+        needle=model.compiled,
+        noise=settings.noise(),
+        low_pass=low_pass,
+        samples=np.zeros(slots, SAMPLE),
+        states=np.zeros((slots, size)),
+        covariances=np.zeros((slots, size, size)),
+        transitions=np.zeros((slots, size, size)),
+        shapes=np.zeros((slots, n, n)),
+        inverses=np.zeros((slots, n, n)),
+        squares=np.zeros((slots, n)),
+        tips=np.zeros((slots, n)),
+        changes=np.zeros((slots, 2 * n, 2 * n)),
+        exposures=np.zeros((exposures, 3)),
+    )
 
 
 def _finite(value: float) -> float:

@@ -14,13 +14,18 @@ from needle_controller import (
     ControllerOutput,
     ControllerSettings,
     Measurement,
+    Observer,
+    ObserverSettings,
     run_controller,
     SafetyLimits,
 )
+from needle_controller.in_loop.observed import TipObserver
+from needle_controller.load_estimator import LoadEstimator
 from needle_controller.safety.safety import Guard
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_identification.bags.bag import message_counts, read_topic
 from needle_insertion.cli import main
+from needle_ros.errors import ParameterError
 from needle_ros.process_pool import processes
 from needle_study.engine import compute, Results
 from needle_study.insertion import CONTROLLERS, METRICS
@@ -132,6 +137,59 @@ def test_metrics_match_the_controller_of_the_node(law: str, late: int) -> None:
     assert found['force'] == pytest.approx(np.abs(run.forces[:, 0]).max(), rel=1e-6)
     assert found['deflection'] == pytest.approx(np.abs(run.tip_deflection).max(), rel=1e-9)
     assert found['stopped'] == found['left'] == 0.0
+
+
+def test_observer_is_that_of_the_node_on_the_replayed_measurements() -> None:
+    """The commands of a replayed sample, from its encoders and tip measurements."""
+    settings = {'controller': 'inverse_dynamics', 'reference': 'minimum_jerk', 'wait': 0.2}
+    study = build_study({
+        **SMALL, 'settings': {**settings, 'observer': {'tip_force': 0.1}}, 'population': {},
+    })  # fmt: skip
+    drawn = {'target': 0.103, 'depth': 0.1, 'tip': 2e-3, 'tissue_stiffness': 1.4,
+             'velocity_noise': 1e-4, 'tip_noise': 2e-4}  # fmt: skip
+    replayed: dict[str, list[Any]] = {}
+    for topic, _, values in study.scenario.replay(drawn, study.design.noise(0)):
+        replayed.setdefault(topic.name, []).append(values)
+    controller = Controller(
+        PHANTOM, 'inverse_dynamics', reference='minimum_jerk',
+        settings=ControllerSettings(rotation=False),
+    )  # fmt: skip
+    controller.set_target(0.103)
+    used = TipObserver(PHANTOM, ObserverSettings(tip_force=0.1), 1e-3, 100.0).used
+    estimator = LoadEstimator(PHANTOM, Observer(PHANTOM, used, 1e-3))
+    expected, loads, errors = [], [], []
+    commands = [values[1] for values in replayed['wrench_command']]
+    for k in range(len(commands)):
+        joints, (_, depth, tip) = replayed['joint_states'][k], replayed['tip_deflection'][k]
+        assert joints[0] == depth
+        measured = Measurement(time=1e-3 * k, depth=joints[0], velocity=joints[2])
+        expected.append(controller.command(measured, estimator.load).force)
+        estimator.take_tip(1_000_000 * k, tip)
+        estimator.take_encoders(1_000_000 * k, measured)
+        estimator.update()
+        loads.append(estimator.load)
+        errors.append(tip - estimator.observer.tip_deflection[0] if estimator.observer else 0.0)
+    # Rounding of the law, amplified by the gain of a measured velocity.
+    np.testing.assert_allclose(commands, expected, atol=1e-8)
+    assert np.abs(loads).max() > 1e-3
+    # The tip is measured with noise, and estimated with less: five standard errors.
+    late = np.array(errors[-150:])
+    assert late.std() == pytest.approx(2e-4, rel=0.3)
+
+
+def test_invalid_observers_are_refused() -> None:
+    for settings, message in (
+        ({'observer': True, 'controller': 'open loop'}, 'observer is for adaptive'),
+        ({'observer': 3}, 'observer must be names with values, got 3'),
+        ({'observer': {'force_noise': 1.0}}, "unknown parameter 'force_noise'"),
+        ({'observer': {'history': 1e-4}}, 'period must be > 0 and < history'),
+        ({'observer': {'tip_noise': 0.0}}, 'settings.observer.tip_noise must be'),
+    ):
+        with pytest.raises(ParameterError) as caught:
+            build_study({**SMALL, 'settings': settings, 'population': {}})
+        assert message in str(caught.value)
+    with pytest.raises(ParameterError, match='tip_noise'):
+        build_study({**SMALL, 'population': {'tip_noise': {'uniform': [0.0, 1e-4]}}})
 
 
 def test_model_mismatch_increases_the_tracking_error() -> None:
