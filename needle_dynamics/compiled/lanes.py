@@ -291,7 +291,11 @@ def _end(w: FloatArray, n: int) -> None:
 
 @compiled
 def empty_lanes(modes: LaneModes) -> FloatArray:
-    return np.zeros((MANY_ROWS if modes.number > 2 else ROWS) * LANES)
+    size = (MANY_ROWS if modes.number > 2 else ROWS) * LANES
+    memory = np.zeros(size + 7)
+    # Vector registers of 64 bytes are loaded faster from their own cache lines.
+    first = (-memory.ctypes.data % 64) // 8
+    return memory[first : first + size]
 
 
 @inlined
