@@ -146,6 +146,8 @@ setup(
         'plan': PLAN,
         # Reference tools of `needle bench`.
         'bench': [
+            'diffrax>=0.6',
+            'jax>=0.5',
             'mcap-ros2-support>=0.5.6',
             'mujoco>=3.2',
             'ompl>=2.0.1',

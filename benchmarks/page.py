@@ -17,7 +17,7 @@ from benchmarks.measure import Bar
 #: Distributions with versions on all pages, and on the page of one benchmark.
 _COMMON: Final = ('needle_insertion', 'numpy', 'scipy', 'numba')
 _TOOLS: Final = {
-    'dynamics': ('mujoco', 'pyelastica'),
+    'dynamics': ('mujoco', 'pyelastica', 'jax', 'diffrax'),
     'identification': ('mcap', 'rosbags', 'mcap-ros2-support'),
     'graph': ('rclpy',),
     'slicer': ('rclpy', 'pyigtl'),
@@ -86,10 +86,13 @@ def header(name: str, command: str) -> str:
     processor = platform.processor() or platform.machine()
     information = Path('/proc/cpuinfo')
     if information.exists():
-        for line in information.read_text('utf-8').splitlines():
-            if line.startswith('model name'):
-                processor = line.partition(':')[2].strip()
-                break
+        lines = information.read_text('utf-8').splitlines()
+        about = {key.strip(): value.strip() for key, _, value in (x.partition(':') for x in lines)}
+        processor = about.get('model name', processor)
+        # Lanes are as wide as the widest vector registers.
+        wide = {'avx512f': 'AVX-512', 'avx2': 'AVX2'}
+        flags = about.get('flags', '').split()
+        processor += ''.join([f', {wide[name]}' for name in wide if name in flags][:1])
     system = f'{platform.system()} {platform.machine()}'
     tools = map(version, (*_COMMON, *_TOOLS.get(name, ())))
     return '\n'.join(

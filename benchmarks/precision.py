@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open-loop run of all presets: our orders and the solvers of one call, at equal errors."""
+"""Open-loop run of four needles: our orders and the solvers of one call, at equal errors."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Final
 
 from benchmarks.measure import Bar, least_times, number
 from benchmarks.page import Answer, PageSection, Tick
-from benchmarks.solvers import ACCURACY, COMPILED, ODEINT, OpenLoopCase
-from needle_dynamics.parameters import PRESETS
+from benchmarks.solvers import ACCURACY, ONE_CALL, OpenLoopCase
 from needle_dynamics.simulated.trajectory import ORDERS
+
+#: The paper's needle, and a needle that bends in stiffer tissue.
+_NEEDLES: Final = ('paper_si', 'paper_mm', 'phantom', 'bending_35mm')
 
 #: Errors, over the peak of the tip deflection.
 _ACCURACIES: Final = (1e-2, ACCURACY, 1e-4, 1e-5, 1e-6, 1e-8)
@@ -27,7 +29,7 @@ def compare(tick: Tick) -> Answer:
     """Compare the times at several errors with the solvers that run in one call."""
     rows = []
     least = dict.fromkeys(_RATIOS, inf)
-    for preset in PRESETS:
+    for preset in _NEEDLES:
         case = OpenLoopCase(preset)
         for accuracy in _ACCURACIES:
             tick(f'{preset}, error {accuracy:g}')
@@ -36,7 +38,7 @@ def compare(tick: Tick) -> Answer:
                 case.ours(graded=True, accuracy=accuracy, order=order, spacing=_GRID)
                 for order in orders
             ]
-            others = [case.other(method, accuracy) for method in (COMPILED, ODEINT)]
+            others = [case.other(method, accuracy) for method in ONE_CALL]
             times = least_times(
                 {one.name: partial(one.run, case.right_hand_side) for one in (*own, *others)}, 9
             )
@@ -49,11 +51,10 @@ def compare(tick: Tick) -> Answer:
     section = PageSection(
         'Work and precision',
         (
-            'preset',
+            'needle',
             'error / peak',
             *(f'ours, order {order}' for order in ORDERS),
-            COMPILED,
-            ODEINT,
+            *ONE_CALL,
             'best of them / best of ours',
         ),
         rows,

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     output = argparse.ArgumentParser(add_help=False)
     output.add_argument('-o', '--output', type=Path, metavar='FILE', help='write the page, too')
     add = partial(names.add_parser, parents=[output])
-    add('dynamics', help='the integrator compared with SciPy, MuJoCo and PyElastica')
+    add('dynamics', help='the integrator compared with SciPy, JAX, MuJoCo and PyElastica')
     honesty = add('honesty', help='the error stated by simulate, compared with the true error')
     honesty.add_argument('--needles', type=int, metavar='N', help='needles of each friction law')
     add('identification', help='time from a bag to a result, compared with other readers')

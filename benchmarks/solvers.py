@@ -12,11 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any, cast, Final, NamedTuple
 from unittest import mock
 import warnings
 
+from benchmarks import in_jax
 from benchmarks.dop853 import build_solver, compiled
 from benchmarks.measure import geometric, least_times, number, seconds
 from benchmarks.page import Answer, PageSection, Tick
@@ -41,6 +42,7 @@ ACCURACY: Final = 1e-3
 
 #: Solvers that run in one compiled call, except for the right-hand side of `odeint`.
 ODEINT, COMPILED = 'odeint (LSODA)', 'DOP853, compiled'
+ONE_CALL: Final = (COMPILED, ODEINT, *in_jax.METHODS)
 METHODS: Final = ('RK45', 'DOP853', 'Radau', 'BDF', 'LSODA', ODEINT)
 
 #: Grids of settings, from loose to tight: ratio of neighbors.
@@ -267,6 +269,7 @@ class OpenLoopCase:
         self.peak = float(np.abs(self._tips(reference.y)).max())
         peaks = np.abs(reference.y).max(axis=1)
         self._peaks = np.where(peaks > 0.0, peaks, 1.0)
+        self._in_jax = cache(partial(in_jax.build_solver, self.model, FORCE, DURATION))
 
     def _tips(self, states: FloatArray) -> FloatArray:
         """Return the tip deflections of states, shape (8, n), also outside the valid range."""
@@ -289,7 +292,11 @@ class OpenLoopCase:
         *,
         steps: bool = True,
     ) -> Run:
-        """Run `COMPILED` or one of `METHODS`; return all `steps` or the final state."""
+        """Run one of `ONE_CALL` or `METHODS`; return all `steps` or the final state."""
+        if method in in_jax.METHODS:
+            run = self._in_jax(method, _STORED * steps)
+            times, states, calls = run(self.start, relative, absolute)
+            return Run(times, states.T, calls)
         if method == COMPILED:
             times, states = np.empty(_STORED * steps), np.empty((_STORED * steps, 8))
             state = self.start.copy()
@@ -306,7 +313,8 @@ class OpenLoopCase:
                 tfirst=True,
                 rtol=relative,
                 atol=absolute,
-                mxstep=_STORED,
+                # Per sample: a run to the end only has one.
+                mxstep=100 * _STORED,
                 full_output=True,
             )
             return Run(grid, values.T, int(given['nfe'][-1]))
@@ -383,7 +391,7 @@ class OpenLoopCase:
         raise RuntimeError('the integrator does not reach the accuracy')
 
     def other(self, method: str, accuracy: float = ACCURACY) -> Candidate:
-        """Return one of `METHODS` or `COMPILED` at the loosest tolerances that meet an error."""
+        """Return a solver at the loosest tolerances that meet an error."""
         found = []
         for name, weights in (('1e-4 rtol', np.full(8, _ABSOLUTE)), ('rtol x peaks', self._peaks)):
             for relative in geometric(0.1, 1e-11, _TOLERANCE_RATIO):
@@ -397,7 +405,7 @@ class OpenLoopCase:
                     setting = f'rtol {relative:.2g}, atol {name}'
                     timed = partial(run, steps=False)
                     spent = min(seconds(partial(timed, self.right_hand_side)) for _ in range(3))
-                    label = method if method in (ODEINT, COMPILED) else f'SciPy {method}'
+                    label = method if method in ONE_CALL else f'SciPy {method}'
                     candidate = Candidate(label, setting, error, solution.nfev, timed)
                     found.append((spent, candidate))
                     break
@@ -409,11 +417,10 @@ def compare(tick: Tick) -> Answer:
     tick('reference')
     case = OpenLoopCase()
     ours, uniform = case.ours(graded=True), case.ours(graded=False)
-    candidates = []
-    for method in METHODS:
+    candidates, peers = list[Candidate](), list[Candidate]()
+    for method in (*METHODS, COMPILED, *in_jax.METHODS):
         tick(f'tolerance of {method}')
-        candidates.append(case.other(method))
-    peer = case.other(COMPILED)
+        (candidates if method in METHODS else peers).append(case.other(method))
     user = user_right_hand_side(case.model, FORCE)
     adaptive = user_right_hand_side(case.model, FORCE, adaptive=True)
 
@@ -421,7 +428,7 @@ def compare(tick: Tick) -> Answer:
     compiled_times = least_times(
         {
             item.name: partial(item.run, case.right_hand_side)
-            for item in (ours, uniform, *candidates, peer)
+            for item in (ours, uniform, *candidates, *peers)
         }
         | {'making': partial(Integrator, case.parameters, case.start, graded=True)},
         15,
@@ -449,7 +456,7 @@ def compare(tick: Tick) -> Answer:
         )
 
     rows = [row(ours, own, 'own'), row(uniform, compiled_times[uniform.name], 'own')]
-    rows += [row(item, compiled_times[item.name], 'compiled') for item in (peer, *candidates)]
+    rows += [row(item, compiled_times[item.name], 'compiled') for item in (*peers, *candidates)]
     rows += [row(item, user_times[item.name], 'NumPy, Gauss') for item in candidates]
     rows.append(row(first, adaptive_time, 'NumPy, quad'))
     section = PageSection(
@@ -472,6 +479,6 @@ def compare(tick: Tick) -> Answer:
         f'on making the integrator.\n'
         f'- Ours is on graded steps, which grow with depth; uniform steps are the default.\n'
         f'- The right-hand side of odeint and of the SciPy solvers is called from Python or '
-        f'through it, 3 us or more each; DOP853, compiled, is one call.',
+        f'through it, 3 us or more each; DOP853, compiled, and diffrax are one call.',
     )
     return [section], []
