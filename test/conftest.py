@@ -17,8 +17,10 @@ import psutil
 import pytest
 from tools.safety_file import RESULTS
 
-# No deadline per example: tests run in parallel.
-settings.register_profile('tests', deadline=None)
+# No deadline per example: tests run in parallel. The same examples in each run; others with
+# ``--hypothesis-profile=random``.
+settings.register_profile('tests', deadline=None, derandomize=True)
+settings.register_profile('random', deadline=None, derandomize=False)
 settings.load_profile('tests')
 
 #: Files whose tests share expensive fixtures, or need most of a machine: each file runs in one
