@@ -22,6 +22,7 @@ _Function = TypeVar('_Function', bound=Callable[..., object])
 _A = np.vstack([DOP853.A, DOP853.B])
 _E3, _E5 = DOP853.E3.copy(), DOP853.E5.copy()
 _STAGES = len(DOP853.B)
+_SHORTEST = 1e-13  #: Shortest step [s].
 
 
 def compiled(function: _Function) -> _Function:
@@ -88,10 +89,11 @@ def build_solver(derivative: Callable[..., None]) -> Callable[..., int]:
         derivative(x, data, slopes[0])
         scales = absolute + relative * np.abs(x)
         h = 0.01 * (((x / scales) ** 2).sum() / ((slopes[0] / scales) ** 2).sum()) ** 0.5
+        h = max(h, 100.0 * _SHORTEST)
         t, count, longest = 0.0, 0, 10.0
         while t < duration:
             h = min(h, duration - t)
-            if h < 1e-13:
+            if h < _SHORTEST:
                 return -1
             for stage in range(1, _STAGES + 1):
                 _combine(x, h, stage, _A, slopes, new)

@@ -55,7 +55,7 @@ _STEPS: Final = (1e-3, 1e-8)  #: longest and shortest tried step [s]
 _GRID: Final = 1e-5
 
 #: Most stored steps.
-_STORED: Final = 20_000
+_STORED: Final = 200_000
 
 #: Absolute over relative tolerance, if not proportional to the peak of each state.
 _ABSOLUTE: Final = 1e-4
@@ -301,6 +301,8 @@ class OpenLoopCase:
             times, states = np.empty(_STORED * steps), np.empty((_STORED * steps, 8))
             state = self.start.copy()
             count = _dop853(state, DURATION, relative, absolute, self._data, times, states)
+            if not steps:
+                return Run(np.array([DURATION]), state[:, np.newaxis], 12 * count)
             found = min(max(count, 1), len(times))
             return Run(times[:found], states[:found].T, 12 * count)
         if method == ODEINT:
@@ -314,7 +316,7 @@ class OpenLoopCase:
                 rtol=relative,
                 atol=absolute,
                 # Per sample: a run to the end only has one.
-                mxstep=100 * _STORED,
+                mxstep=10 * _STORED,
                 full_output=True,
             )
             return Run(grid, values.T, int(given['nfe'][-1]))

@@ -73,6 +73,19 @@ def test_run_error_is_relative_tip_error(open_loop: OpenLoopCase) -> None:
     assert open_loop.error(run.t[:-1], run.y[:, :-1]) == np.inf
 
 
+@pytest.mark.parametrize('name', solvers.ONE_CALL)
+def test_timed_run_of_a_solver_is_complete(name: str) -> None:
+    """To the end, with the state of the run whose error is judged; diffrax if it is installed."""
+    case = solvers.OpenLoopCase('paper_mm')
+    relative, absolute = 1e-9, 1e-9 * case._peaks
+    judged = case.solve(name, relative, absolute, case.right_hand_side)
+    assert case.error(judged.t, judged.y) < 1e-6
+    # 81,000 calls of the right-hand side by LSODA: more than its usual limits.
+    timed = case.solve(name, relative, absolute, case.right_hand_side, steps=False)
+    # LSODA ends its steps at the samples: 5e-8 of the peaks found.
+    assert (np.abs(timed.y[:, -1] - judged.y[:, -1]) <= 1e-6 * case._peaks).all()
+
+
 def test_right_hand_side_accepts_states_outside_range(open_loop: OpenLoopCase) -> None:
     beyond = open_loop.start.copy()
     for remaining in (-1.0, 0.3, np.nan):
