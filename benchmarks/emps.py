@@ -40,7 +40,7 @@ _REVERSAL: Final = 0.024  #: time around a reversal, of a filter of 30 Hz [s]
 _FINE: Final = 4  #: steps of the simulation in a sample
 
 
-class Axis:
+class MachineAxis:
     """Recording of the axis: samples every 1 ms, forces in N, positions in m."""
 
     def __init__(self, path: Path) -> None:
@@ -83,7 +83,7 @@ class Axis:
 
 def main(path: Path) -> None:
     """Print the identified constants next to those of the reference."""
-    axis = Axis(path)
+    axis = MachineAxis(path)
     ours = identify_friction(read_friction_recording(path, columns=_COLUMNS), _SETTINGS)
     found: list[ParameterEstimate] = [ours[name] for name in _NAMES]
     every, without = axis.fit(without=0.0), axis.fit(without=_REVERSAL)
