@@ -17,6 +17,7 @@ from typing import Final
 
 from benchmarks.page import table
 from needle_dynamics import FloatArray
+from needle_dynamics.compiled.friction import COULOMB, friction_flow, FrictionConstants
 from needle_identification import (
     FrictionSettings,
     identify_friction,
@@ -37,7 +38,6 @@ _REFERENCE: Final = (95.1089, 203.5034, 20.3935, -3.1648)
 
 _CUTOFFS: Final = (100.0, 40.0)  #: low-pass filters of the motion, and of the regression [Hz]
 _REVERSAL: Final = 0.024  #: time around a reversal, of a filter of 30 Hz [s]
-_FINE: Final = 4  #: steps of the simulation in a sample
 
 
 class MachineAxis:
@@ -68,16 +68,14 @@ class MachineAxis:
     def simulated_error(self, values: FloatArray) -> float:
         """Return the error of positions simulated in the position loop, over their norm."""
         mass, viscous, coulomb, offset = values.tolist()
-        x, v, h = float(self.position[0]), 0.0, self.period / _FINE
+        friction = FrictionConstants(COULOMB, coulomb, viscous, 1.0, 1.0, 1.0, 1.0)
+        x, v = float(self.position[0]), 0.0
         found = np.empty_like(self.position)
         for k, goal in enumerate(self.goal.tolist()):
             found[k] = x
             drive = self.gain * self.kv * (self.kp * (goal - x) - v) - offset
-            for _ in range(_FINE):
-                free = v + h * (drive - viscous * v) / mass
-                # Implicit friction: it stops the axis, and does not turn it around.
-                new = float(np.sign(free)) * max(abs(free) - h * coulomb / mass, 0.0)
-                x, v = x + 0.5 * h * (v + new), new
+            v, way = friction_flow(friction, mass, v, drive, self.period)
+            x += way
         return float(np.linalg.norm(found - self.position) / np.linalg.norm(self.position))
 
 

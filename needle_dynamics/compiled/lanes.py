@@ -293,7 +293,7 @@ def _end(w: FloatArray, n: int) -> None:
 def empty_lanes(modes: LaneModes) -> FloatArray:
     size = (MANY_ROWS if modes.number > 2 else ROWS) * LANES
     memory = np.zeros(size + 7)
-    # Vector registers of 64 bytes are loaded faster from their own cache lines.
+    # A register of 64 bytes is then loaded from a single cache line.
     first = (-memory.ctypes.data % 64) // 8
     return memory[first : first + size]
 

@@ -175,6 +175,13 @@ def test_observer_is_that_of_the_node_on_the_replayed_measurements() -> None:
     # The tip is measured with noise, and estimated with less: five standard errors.
     late = np.array(errors[-150:])
     assert late.std() == pytest.approx(2e-4, rel=0.3)
+    # The vibration at the start is larger than the noise, the residual of the estimate smaller.
+    tips = np.array([values[2] for values in replayed['tip_deflection']])[: len(errors)]
+    first = slice(1, 31)
+    assert np.sqrt(np.mean(tips[first] ** 2)) > 3.0 * 2e-4
+    assert np.sqrt(np.mean(np.array(errors[first]) ** 2)) < 2e-4
+    # The needle is straight at the end: a copy of the measurements would have their noise.
+    assert np.sqrt(np.mean((tips[-150:] - late) ** 2)) < 0.5 * 2e-4
 
 
 def test_invalid_observers_are_refused() -> None:

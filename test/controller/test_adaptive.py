@@ -71,7 +71,7 @@ def test_friction_mismatch_is_learned() -> None:
         assert error < (0.02 if 'dry' in name else 15.0), name
 
 
-@settings(deadline=None, derandomize=True, max_examples=50)
+@settings(max_examples=50)
 @given(
     st.lists(
         st.tuples(*[st.floats(-1e3, 1e3)] * 3, st.floats(-1.0, 1.0)), min_size=5, max_size=60

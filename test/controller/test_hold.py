@@ -10,9 +10,10 @@ from benchmarks.loop import Loop, LoopFault, Sent
 from benchmarks.stalls import fastest, insert, LIMIT, Stall, StalledLoop, TARGET, VICTIMS
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from needle_controller import Controller, Measurement, Setpoint
+from needle_controller import Controller, Measurement, ReferenceLimits, Setpoint
 from needle_controller.controller import LAWS
 from needle_dynamics import NeedleParameters
+from needle_dynamics.simulated.assembly import PlantSettings
 from needle_ros.contract import NEWEST
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ OVERSHOOT = 0.2
 
 #: Velocity that a lost command adds when its force is held [m/s]: the acceleration limit of the
 #: reference over the timeout of the plant.
-HELD = 0.1 * 0.1
+HELD = ReferenceLimits().acceleration * PlantSettings().command_timeout
 
 #: Largest distance from the target at rest [m]: dry friction, 0.56 N, over the stiffness of PID.
 AT_REST = 1e-4

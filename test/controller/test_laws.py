@@ -33,7 +33,6 @@ inertias = st.floats(1e-4, 10.0)
 viscosities = st.floats(0.0, 500.0)
 
 
-@settings(deadline=None, derandomize=True)
 @given(numbers, numbers, numbers, inertias, viscosities)
 def test_inverse_dynamics_gives_the_commanded_velocity(
     position: float, speed: float, load: float, inertia: float, viscous: float
@@ -68,7 +67,6 @@ def test_inverse_dynamics_converges_to_the_continuous_law() -> None:
     assert_allclose(errors[0] / errors[1], 10.0, rtol=0.05)
 
 
-@settings(deadline=None, derandomize=True)
 @given(numbers, numbers, numbers, inertias, viscosities, st.floats(0.0, 0.1), numbers)
 def test_pid_is_evaluated_at_the_end_of_the_period(
     position: float,
@@ -101,7 +99,7 @@ def test_pid_is_evaluated_at_the_end_of_the_period(
     assert abs(loop.memory[RATE] - low) < 1e-11 * scale
 
 
-@settings(deadline=None, derandomize=True, max_examples=200)
+@settings(max_examples=200)
 @given(st.floats(-3.0, 6.0), st.sampled_from([1e-6, 1e-3]))
 def test_response_is_exact(damping: float, t: float) -> None:
     """Every entry agrees with the matrix exponential in 40 digits, for weak and strong damping."""
@@ -136,7 +134,7 @@ def test_invalid_axes_are_rejected(changes: dict[str, Any], words: str) -> None:
         Axis(**changes)
 
 
-@settings(deadline=None, derandomize=True, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 5), st.lists(numbers, min_size=8, max_size=8))
 def test_prediction_compensates_the_delay(delay: int, kicks: list[float]) -> None:
     """With its nominal axis, the depths equal the depths without delay, shifted by the delay."""
@@ -235,7 +233,6 @@ def test_feed_forward_follows_the_reference(axis: Axis) -> None:
     assert worst[True] < 0.05 * worst[False]
 
 
-@settings(deadline=None, derandomize=True)
 @given(
     numbers,
     numbers,

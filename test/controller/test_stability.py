@@ -30,9 +30,7 @@ PHANTOM = Axis.insertion(MODEL.parameters)
 PAPER_SI = Axis.insertion(NeedleParameters.preset('paper_si'))
 PERIOD = 1e-3
 
-PROPERTY = settings(
-    deadline=None, derandomize=True, suppress_health_check=[HealthCheck.filter_too_much]
-)
+PROPERTY = settings(suppress_health_check=[HealthCheck.filter_too_much])
 
 
 @pytest.mark.parametrize('delay', [0, 1, 3])

@@ -459,7 +459,7 @@ SLIDES = {
 
 
 @given(**SLIDES)
-@settings(deadline=None, derandomize=True, max_examples=150)
+@settings(max_examples=150)
 def test_slide_is_the_exact_flow(
     u: float, drive: float, mass: float, coulomb: float, ratio: float, t: float
 ) -> None:
@@ -474,7 +474,7 @@ def test_slide_is_the_exact_flow(
 
 
 @given(**SLIDES, part=st.floats(0.0, 1.0))
-@settings(deadline=None, derandomize=True, max_examples=300)
+@settings(max_examples=300)
 def test_slide_has_the_flow_property(
     u: float, drive: float, mass: float, coulomb: float, ratio: float, t: float, part: float
 ) -> None:
@@ -490,7 +490,7 @@ def test_slide_has_the_flow_property(
 
 
 @given(**SLIDES)
-@settings(deadline=None, derandomize=True, max_examples=300)
+@settings(max_examples=300)
 def test_slide_is_symmetric_in_direction(
     u: float, drive: float, mass: float, coulomb: float, ratio: float, t: float
 ) -> None:
@@ -820,7 +820,7 @@ def test_axial_force_excludes_the_inertia_of_the_carriage() -> None:
 
 
 @given(start=st.floats(-0.2, 0.2), end=st.floats(-0.2, 0.2), tip=st.floats(-5e-4, 5e-4))
-@settings(deadline=None, derandomize=True, max_examples=50)
+@settings(max_examples=50)
 def test_moved_base_has_exact_kinematics(start: float, end: float, tip: float) -> None:
     """The velocity of the base changes linearly, independent of the needle."""
     it = needle(depth=0.08, speed=start, tip_deflection=tip)

@@ -173,7 +173,6 @@ def test_friction_opposes_motion(speed: float) -> None:
 
 
 @given(fraction=st.floats(-1.0, 1.0))
-@settings(deadline=None, derandomize=True)
 def test_friction_at_rest_balances_any_drive_within_its_bound(fraction: float) -> None:
     """At rest a drive of at most mu_s causes neither acceleration nor creep."""
     of = model()
@@ -216,7 +215,6 @@ def test_power_balance() -> None:
 
 
 @given(depth=st.floats(1.1e-3, 0.2), tip=st.floats(-1e-2, 1e-2))
-@settings(deadline=None, derandomize=True)
 def test_state_at_gives_the_least_energy_shape_for_a_tip_deflection(
     depth: float, tip: float
 ) -> None:
@@ -261,7 +259,7 @@ def test_tip_deflection_is_the_end_of_the_shape() -> None:
 
 
 @given(shape=st.lists(st.integers(0, 9), max_size=3).filter(lambda s: s != [8]))
-@settings(deadline=None, derandomize=True, max_examples=50)
+@settings(max_examples=50)
 def test_invalid_state_shapes_are_rejected(shape: list[int]) -> None:
     """Only shape (8,) is valid; the message contains the given shape."""
     of = model()

@@ -224,7 +224,7 @@ def test_integrals_vanish_at_zero_depth() -> None:
 
 
 @given(shape=st.lists(st.integers(0, 4), max_size=3))
-@settings(deadline=None, derandomize=True, max_examples=30)
+@settings(max_examples=30)
 def test_values_have_the_shape_of_their_argument(shape: list[int]) -> None:
     """Values and curvatures append one axis of length 2 to the shape of y."""
     y = np.zeros(shape)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from math import exp
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_dynamics.compiled.friction import decay_means, glide
@@ -74,7 +74,6 @@ def test_normal_modes_diagonalize_mass_and_stiffness(n: int, depth: float) -> No
 
 
 @given(st.floats(0.0, 1e4), st.floats(0.0, 5.0).map(lambda e: 10.0**e), st.floats(1e-5, 1e-2))
-@settings(deadline=None, derandomize=True)
 def test_swing_is_the_matrix_exponential(damping: float, square: float, t: float) -> None:
     """Position and velocity match the matrix exponential of the system."""
     exact = expm(t * np.array([[0.0, 1.0], [-square, -damping]]))

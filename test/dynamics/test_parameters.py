@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import asdict, fields, FrozenInstanceError, replace
 from typing import Any
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics import NeedleError, NeedleParameters, ParameterError
 from needle_dynamics.parameters import PRESETS
@@ -202,7 +202,6 @@ def test_integers_are_converted_to_floats() -> None:
         | {'length': st.floats(1e-2, 1.0), 'hub_stop': st.booleans()},
     )
 )
-@settings(deadline=None, derandomize=True)
 def test_mapping_round_trip(values: dict[str, Any]) -> None:
     """`from_mapping` uses defaults for missing keys, and `asdict` is its inverse."""
     made = from_values(NeedleParameters, values)

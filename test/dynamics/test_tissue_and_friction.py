@@ -74,7 +74,7 @@ def by_layers(
     depth=st.floats(0.02, LENGTH),
     n=st.sampled_from([1, 2, 3]),
 )
-@settings(deadline=None, derandomize=True, max_examples=100)
+@settings(max_examples=100)
 def test_modal_tissue_stiffness_is_the_integral_over_layers(
     starts: list[float], stiffnesses: list[float], depth: float, n: int
 ) -> None:
@@ -477,7 +477,7 @@ def axis(
 
 
 @given(**AXIS, u=st.floats(-1.0, 1.0), drive=st.floats(-10.0, 10.0))
-@settings(deadline=None, derandomize=True, max_examples=300)
+@settings(max_examples=300)
 def test_friction_power_is_never_positive(
     law: str,
     coulomb: float,
@@ -502,7 +502,7 @@ def test_friction_power_is_never_positive(
     drive=st.floats(-10.0, 10.0),
     exponent=st.floats(-7.0, -3.0),
 )
-@settings(deadline=None, derandomize=True, max_examples=1000)
+@settings(max_examples=1000)
 def test_friction_never_supplies_energy_in_a_step(
     law: str,
     coulomb: float,
@@ -531,7 +531,7 @@ def test_friction_never_supplies_energy_in_a_step(
     drive=st.floats(-10.0, 10.0),
     exponent=st.floats(-7.0, -2.0),
 )
-@settings(deadline=None, derandomize=True, max_examples=300)
+@settings(max_examples=300)
 def test_smooth_friction_gives_monotonic_velocity(
     coulomb: float, viscous: float, withdrawal: float, u: float, drive: float, exponent: float
 ) -> None:
