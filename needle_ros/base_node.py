@@ -56,6 +56,10 @@ def steady_timer(node: Node, period: float, act: Callable[[], object]) -> Timer:
     return node.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
+def _nothing() -> None:
+    pass
+
+
 def message_class(*type_names: str, kind: str = 'msg') -> Any:
     """Import the class of the only type of a topic, such as ``sensor_msgs/msg/JointState``."""
     # rosidl_runtime_py has the same function, but is not in the wheels.
@@ -210,6 +214,11 @@ class BaseNode(ParameterNode):
             raw=True,
             event_callbacks=events,
         )
+
+    def destroy_timer(self, timer: Timer) -> bool:
+        # EventsExecutor can call a destroyed timer once more.
+        timer.callback = _nothing
+        return bool(super().destroy_timer(timer))
 
     def _after_change(self, _parameters: list[Parameter]) -> None:
         if self._configured:

@@ -115,7 +115,8 @@ def test_batches_are_independent_of_threads_and_store_states_on_request() -> Non
     assert len(np.unique(ends[0], axis=0)) == 40
     short, long = (many.peak_memory(part, keep=False) for part in (0.1, 1.0))
     kept = many.peak_memory(1.0, keep=True)
-    assert long < 1.5 * short < kept
+    # Only arrays of all insertions together grow with the samples, by 3 % of the kept states.
+    assert long - short < 0.1 * (kept - short)
 
 
 def test_exact_frequency_solves_beam_equation() -> None:

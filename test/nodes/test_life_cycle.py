@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from needle_identification.identification_node import IdentificationNode
 from needle_identification.player_node import PlayerNode
 from needle_identification.recorder_node import RecorderNode
 from needle_insertion.slicer.slicer_node import SlicerNode
-from needle_ros.base_node import BaseNode
+from needle_ros.base_node import BaseNode, steady_timer
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
 from reproduction.protocol import SHIPPED_BAGS
@@ -71,6 +72,24 @@ def test_cleanup_and_shutdown_destroy_what_was_created(
         assert entities(node) == before
         if end != 'cleanup':
             break
+
+
+def test_destroyed_timer_is_not_called(ros_graph: RosGraph) -> None:
+    """Not even if it is due already: a socket, for example, would be opened again."""
+    node, late = ros_graph.add(PlantNode, start=False), []
+    # Without the override, 20 of 50 rounds call a destroyed timer.
+    for _ in range(50):
+        calls: list[int] = []
+        timers = [steady_timer(node, 1e-3, partial(calls.append, one)) for one in range(20)]
+        ros_graph.spin_until(calls.copy, 'the first timer')
+        for timer in timers:
+            node.destroy_timer(timer)
+        before, again = len(calls), []
+        timer = steady_timer(node, 1e-3, partial(again.append, 0))
+        ros_graph.spin_until(again.copy, 'a later timer')
+        node.destroy_timer(timer)
+        late += calls[before:]
+    assert not late
 
 
 def test_failed_configuration_leaves_nothing(ros_graph: RosGraph) -> None:
