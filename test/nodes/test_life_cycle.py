@@ -84,7 +84,8 @@ def test_destroyed_timer_is_not_called(ros_graph: RosGraph) -> None:
         ros_graph.spin_until(calls.copy, 'the first timer')
         for timer in timers:
             node.destroy_timer(timer)
-        before, again = len(calls), []
+        again: list[int] = []
+        before = len(calls)
         timer = steady_timer(node, 1e-3, partial(again.append, 0))
         ros_graph.spin_until(again.copy, 'a later timer')
         node.destroy_timer(timer)
