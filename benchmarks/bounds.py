@@ -109,7 +109,8 @@ def friction_truth(
     }
     names = [column.name for column in columns_of(settings.terms, settings)]
     still = np.zeros_like(time)
-    motion = NeedleMotion(speed, np.gradient(speed, time), time - time[0], still, still > 0.0)
+    accelerated, since = np.gradient(speed, time), time - time[0]
+    motion = NeedleMotion(speed, accelerated, since, still, still > 0.0, np.sign(speed))
     known = information(
         regressors(motion, settings.terms, settings),
         reading_noise(sensor, 1),

@@ -4,13 +4,13 @@ Friction of a public machine axis: ``python -m benchmarks.emps DATA_EMPS.mat``.
 
 The electro-mechanical positioning system (A. Janot, M. Gautier, M. Brunot, "Data set and reference
 models of EMPS", 2019) is a carriage with a ball screw. The file is not part of this project. Its
-reference model is the least-squares fit of its authors to all samples. Here it is also fitted
-without samples near reversals, which our identification does not use: its filter mixes both
-signs there.
+reference model is the least-squares fit of its authors to all samples. Our identification is
+compared with it with `reversals`, and without them with the same fit to the other samples.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 import sys
 from typing import Final
@@ -31,8 +31,7 @@ from scipy.signal import butter, filtfilt
 
 _COLUMNS: Final = {'time': 't', 'depth': 'qm', 'force': 'vir*gtau'}
 _TERMS: Final = ('inertia', 'viscous', 'coulomb', 'offset')
-#: The samples of all accelerations.
-_SETTINGS: Final = FrictionSettings(terms=_TERMS, largest_acceleration=25.0)
+_SETTINGS: Final = FrictionSettings(terms=_TERMS)
 _NAMES: Final = ('moving_mass', 'viscous_friction', 'coulomb_friction', 'offset')
 _REFERENCE: Final = (95.1089, 203.5034, 20.3935, -3.1648)
 
@@ -80,32 +79,29 @@ class MachineAxis:
 
 
 def main(path: Path) -> None:
-    """Print the identified constants next to those of the reference."""
-    axis = MachineAxis(path)
-    ours = identify_friction(read_friction_recording(path, columns=_COLUMNS), _SETTINGS)
-    found: list[ParameterEstimate] = [ours[name] for name in _NAMES]
-    every, without = axis.fit(without=0.0), axis.fit(without=_REVERSAL)
-    rows = [
-        (
-            one.name,
-            f'{one.value:.4g}',
-            f'{one.interval[0]:.4g} to {one.interval[1]:.4g}',
-            *(f'{other:.4g}' for other in (reference, again, alike)),
-            f'{one.value / reference - 1.0:+.1%}',
-            f'{one.value / alike - 1.0:+.1%}',
+    """Print the constants identified from the same samples as those of the reference fits."""
+    axis, recording = MachineAxis(path), read_friction_recording(path, columns=_COLUMNS)
+    fits = {False: axis.fit(without=_REVERSAL), True: np.array(_REFERENCE)}
+    for reversals, reference in fits.items():
+        ours = identify_friction(recording, replace(_SETTINGS, reversals=reversals))
+        found: list[ParameterEstimate] = [ours[name] for name in _NAMES]
+        rows = [
+            (
+                one.name,
+                f'{one.value:.4g}',
+                f'{one.interval[0]:.4g} to {one.interval[1]:.4g}',
+                f'{other:.4g}',
+                f'{one.value / other - 1.0:+.2%}',
+            )
+            for one, other in zip(found, reference.tolist(), strict=True)
+        ]
+        values = np.array([one.value for one in found])
+        errors = [axis.simulated_error(each) for each in (values, reference)]
+        other = 'reference' if reversals else 'method of the reference without reversals'
+        sys.stdout.write(
+            f'{table(("constant", "ours", "95 % interval", other, "difference"), rows)}\n\n'
+            f'error of simulated positions: {errors[0]:.4%} and {errors[1]:.4%}\n\n'
         )
-        for one, reference, again, alike in zip(found, _REFERENCE, every, without, strict=True)
-    ]
-    values = np.array([one.value for one in found])
-    errors = [axis.simulated_error(each) for each in (values, np.array(_REFERENCE))]
-    heads = (
-        'constant', 'ours', '95 % interval', 'reference', 'fit again', 'without reversals',
-        'ours over reference', 'ours over the fit without reversals',
-    )  # fmt: skip
-    sys.stdout.write(
-        f'{table(heads, rows)}\n\nerror of simulated positions: ours {errors[0]:.4%}, '
-        f'reference {errors[1]:.4%}\n'
-    )
 
 
 if __name__ == '__main__':

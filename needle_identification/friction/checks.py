@@ -14,6 +14,7 @@ import numpy as np
 
 _UNUSUAL_LAG: Final = 0.01  # largest lag of usual sensor filters [s]
 _MUCH_LARGER: Final = 1.5  # growth of the errors by autocorrelated noise for a warning
+_DOUBT: Final = 1e-4  # p-value of the terms at reversals for a warning
 _WANDERS: Final = 0.25  # part of the recording: longer correlation is not finite
 _FRICTION: Final = ('coulomb_friction', 'viscous_friction')
 
@@ -79,6 +80,11 @@ def fit_warnings(
             ': choose estimator total' if settings.allows_total else ', which nothing corrects'
         )
         yield noise_words(design, bias) + remedy
+    if settings.reversals and design.doubt_at_reversals() < _DOUBT:
+        yield (
+            'at reversals the force does not follow the terms (presliding or breakaway), which '
+            'changes the estimates: without reversals these samples are left out'
+        )
     yield from _of_memory(design, fit)
     known = {parameter.name: parameter for parameter in parameters if parameter.determined}
     if {'moving_mass', 'viscous_friction'} <= set(known):

@@ -13,7 +13,7 @@ from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import Regression, score_covariance, wald_test
 from needle_identification.estimation.screening import Screening, Trial
 from needle_identification.friction.design import Design
-from needle_identification.friction.settings import TERMS
+from needle_identification.friction.settings import LINEAR, TERMS
 from needle_identification.friction.terms import columns_of
 import numpy as np
 
@@ -75,6 +75,8 @@ def _candidates(design: Design) -> list[str]:
     chosen = set(settings.terms)
     # The user must give the boundaries of layers.
     excluded = chosen | {'layers'}
+    if settings.reversals:
+        excluded |= set(TERMS) - LINEAR
     if design.estimates_lag:
         excluded.add('inertia')
     if 'layers' in chosen:

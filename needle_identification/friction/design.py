@@ -90,7 +90,8 @@ class Design:
         if later:
             velocity, depth = velocity - later * self.acceleration, depth - later * velocity
         time = signals.time - signals.time[0]
-        motion = NeedleMotion(velocity, self.acceleration, time, depth, self.fresh)
+        sign = signals.sign if signals.settings.reversals else np.sign(velocity)
+        motion = NeedleMotion(velocity, self.acceleration, time, depth, self.fresh, sign)
         return regressors(motion, terms, signals.settings)
 
     def reaches(self, term: str) -> bool:
@@ -126,6 +127,12 @@ class Design:
         # The error is the root mean square over all shifts in time.
         shifted = np.fft.irfft(np.fft.rfft(column).conj() * np.fft.rfft(residual), len(column))
         return float(shifted[0] / np.sqrt(np.mean(shifted**2)))
+
+    def doubt_at_reversals(self) -> float:
+        """Return the p-value of a delayed sign of friction, and of breakaway, at reversals."""
+        sign = self.signals.sign
+        columns = np.column_stack([np.gradient(sign), sign * (1.0 - sign**2)])
+        return self.screening().tried(columns[self.used]).p_value
 
     def lag_spread(self) -> Trial:
         """Return the variance [s^2] of the lag that the fit lacks."""
@@ -202,9 +209,13 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
     settling -= HALF_LENGTH / settings.cutoff / 1.5
     more = max(0, ceil(settling / signals.period))
     margin = signals.margin + more
-    used = (regime != 0.0) & (time - lag >= time[0])
+    moves, border = regime != 0.0, change
+    if settings.reversals:
+        turning, begins = _reversals(regime, signals.half_filter)
+        moves, border = moves | turning, change & (signals.lost | ~begins)
+    used = moves & (time - lag >= time[0])
     used &= time - lag <= time[-1]
-    used &= maximum_filter1d(change.astype(np.uint8), 2 * margin + 1) == 0
+    used &= maximum_filter1d(border.astype(np.uint8), 2 * margin + 1) == 0
     if 'inertia' not in settings.terms:
         large = np.abs(acceleration) > settings.largest_acceleration
         size = 2 * (signals.half_filter + more) + 1
@@ -222,3 +233,17 @@ def select_samples(signals: FilteredSignals, lag: float, settling_lag: float) ->
         stroke=np.cumsum(change),
         lag_column=np.empty((len(velocity), 0)),
     )
+
+
+def _reversals(regime: FloatArray, longest: int) -> tuple[BoolArray, BoolArray]:
+    """Mark rests of up to ``longest`` samples within reversals, and the changes of reversals."""
+    starts = np.flatnonzero(np.diff(regime, prepend=np.nan) != 0.0)
+    ends = np.append(starts[1:], len(regime))
+    sign = regime[starts]
+    turning, begins = np.zeros((2, len(regime)), dtype=np.bool_)
+    begins[starts[1:][sign[1:] * sign[:-1] < 0.0]] = True
+    for k in np.flatnonzero(sign[2:] * sign[:-2] < 0.0) + 1:
+        if sign[k] == 0.0 and ends[k] - starts[k] <= longest:
+            turning[starts[k] : ends[k]] = True
+            begins[[starts[k], ends[k]]] = True
+    return turning, begins

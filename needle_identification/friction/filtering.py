@@ -47,6 +47,7 @@ class FilteredSignals:
     period: float  # after resampling [s]
     motion: BSpline  # velocity [m/s] as a function of time [s]
     undelayed: tuple[FloatArray, FloatArray]  # velocity [m/s] and acceleration [m/s^2] at `time`
+    sign: FloatArray  # of the velocity; with `reversals` filtered as the force
     lost: BoolArray  # in a gap of the recording, or saturated
     half_filter: int  # half the length of the filter [samples]
     margin: int  # reach of a change of the velocity in the force [samples]
@@ -106,13 +107,14 @@ def filter_signals(
     around = np.arange(len(impulse), dtype=np.float64) * period
     response = _filtered_velocity(around, impulse, of_motion, 1, from_positions)
     velocity, acceleration = motion(grid), motion(grid, 1)
-    noise = _white_noise(raw, velocity, acceleration)
+    noise, sign = _white_noise(raw, velocity, acceleration), np.sign(velocity)
     return FilteredSignals(
         settings=settings,
         time=grid[::step],
         period=step * period,
         motion=motion,
         undelayed=(velocity[::step], acceleration[::step]),
+        sign=(_smooth(sign, taps) if settings.reversals else sign)[::step],
         force=_smooth(np.interp(grid, time, recording.force), taps)[::step],
         depth=np.asarray(np.interp(grid[::step], time, recording.depth)),
         lost=np.asarray(maximum_filter1d(lost.astype(np.uint8), step)[::step] > 0),

@@ -194,7 +194,7 @@ def _without_transitions(_recording: Recording, chosen: _Candidate) -> _Candidat
     """Leave out more samples around each change if the force deviates from the terms there."""
     settings = chosen.design.signals.settings
     design = chosen.design.far_from_changes(_TRANSITION)
-    if chosen.fit.is_exact or not design.is_enough:
+    if chosen.fit.is_exact or settings.reversals or not design.is_enough:
         return None
     if not chosen.design.excess_after_changes(_BEGIN, chosen.fit.residual) < -_DEVIATES:
         return None

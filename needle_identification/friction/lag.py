@@ -89,7 +89,8 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
     if np.count_nonzero(moving) <= FEWEST_SAMPLES:
         return np.nan
     depth = np.interp(then, signals.time, signals.depth)
-    motion = NeedleMotion(velocity, acceleration, time - time[0], depth, np.zeros_like(moving))
+    sign, fresh = np.sign(velocity), np.zeros_like(moving)
+    motion = NeedleMotion(velocity, acceleration, time - time[0], depth, fresh, sign)
     x = regressors(motion, settings.terms, settings)[moving]
     solution = np.linalg.lstsq(x, force[moving], rcond=None)[0]
     return float(np.mean((force[moving] - x @ solution) ** 2))

@@ -8,13 +8,16 @@ from typing import Final
 
 from needle_identification.estimation import ESTIMATORS
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_choice, check_constants, choice, positive
+from needle_ros.settings import check_choice, check_constants, choice, flag, positive
 
 #: Terms of the friction force, by name; their equations are in `terms`.
 TERMS: Final = (
     'coulomb', 'viscous', 'offset', 'drift', 'inertia', 'direction', 'stribeck', 'length',
     'layers', 'cutting', 'spring', 'decay',
 )  # fmt: skip
+
+#: Terms that remain linear within the filter window of a reversal.
+LINEAR: Final = frozenset(TERMS) - {'direction', 'stribeck', 'cutting'}
 
 AUTO: Final = 'auto'  #: automatic choice of the estimator
 
@@ -41,6 +44,9 @@ class FrictionSettings:
         metadata={
             'description': 'insertion depths at which layers begin, for the term layers [m]'
         },
+    )
+    reversals: bool = flag(
+        False, 'use the samples at reversals, too, if friction is known to change its sign at once'
     )
     terms: tuple[str, ...] = field(
         default=('coulomb', 'viscous'), metadata={'description': f'of {", ".join(TERMS)}'}
@@ -71,6 +77,11 @@ class FrictionSettings:
             raise ParameterError(f'terms must be distinct, at least one, got {list(self.terms)}')
         for term in self.terms:
             check_choice('terms', term, TERMS)
+        if self.reversals and not {'inertia'} <= set(self.terms) <= LINEAR:
+            raise ParameterError(
+                f'reversals needs the term inertia, and none of '
+                f'{", ".join(sorted(set(TERMS) - LINEAR))}, got {", ".join(self.terms)}'
+            )
         if 'direction' in self.terms and not {'coulomb', 'viscous'} <= set(self.terms):
             raise ParameterError('the term direction needs the terms coulomb and viscous')
         if self.estimator == 'total' and not self.allows_total:

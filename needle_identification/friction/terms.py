@@ -35,10 +35,7 @@ class NeedleMotion(NamedTuple):
     time: FloatArray  # since the start of the recording [s]
     depth: FloatArray  # insertion depth [m]
     fresh: BoolArray  # at the largest insertion depth so far
-
-    @property
-    def sign(self) -> FloatArray:
-        return np.asarray(np.sign(self.velocity))
+    sign: FloatArray  # of the velocity, or filtered as the force
 
 
 @dataclass(frozen=True, slots=True)

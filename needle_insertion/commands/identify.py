@@ -141,10 +141,12 @@ def _add_common(
         f'total, with noise in the motion (default {estimators[0]})',
     )
     for item in fields(defaults):
-        if 'unit' in item.metadata:
+        name = f'--{item.name.replace("_", "-")}'
+        if item.metadata.get('type') is bool:
+            common.add_flag(fitting, name, item.metadata['description'])
+        elif 'unit' in item.metadata:
             unit = item.metadata['unit']
             default = f'{item.default:g} {unit}'.removesuffix(' 1')
-            name = f'--{item.name.replace("_", "-")}'
             meaning = f'{item.metadata["description"]} (default {default})'
             common.add_quantity(fitting, name, unit, meaning, item.default)
     return reading, fitting
