@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Setpoints over time and their limits: the interface of all references."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from needle_ros.settings import CheckedSettings, positive
 
@@ -27,11 +28,12 @@ class ReferenceLimits(CheckedSettings):
     acceleration: float = positive(0.1, 'm/s^2', 'highest acceleration of the reference')
 
 
-class Reference(Protocol):
+class Reference(ABC):
     """Motion that ends at rest, with times from its start [s]."""
 
     duration: float  #: Duration of the motion [s].
 
+    @abstractmethod
     def at(self, time: float) -> Setpoint:
         """Return the setpoint at a time since the start [s]; it rests before and after."""
 
