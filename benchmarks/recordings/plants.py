@@ -24,7 +24,7 @@ from needle_dynamics import FloatArray, SteeredNeedle, SteeringParameters
 from needle_dynamics.needles import NEEDLES
 from needle_dynamics.steering.parameters import tissue_of
 from needle_identification import SteeringRecording
-from needle_identification.steering.search import rms_of, Search, Tips
+from needle_identification.steering.search import rms_of, searched, Tips
 import numpy as np
 
 #: Order of guide motion and insertion of the recordings, and of the simulated insertion.
@@ -112,8 +112,8 @@ class BeamMedium:
     @classmethod
     def fit(cls, recordings: Sequence[SteeringRecording]) -> BeamMedium:
         """Fit bending length, skin, tilt, and an offset of each recording."""
-        search = Search(Tips(recordings, ORDER), _TERMS, FREE)
-        x = search.optima()[0].x
+        search, (best, *_) = searched(Tips(recordings, ORDER), _TERMS, FREE)
+        x = best.x
         [(_, length, skin)] = search.lengths(x)
         tilt_x, tilt_z = search.fits(x)[0].drift.tolist()
         rms = rms_of(search.residuals(x))

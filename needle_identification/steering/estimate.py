@@ -83,7 +83,6 @@ class SteeringEstimate(DisplayedEstimate):
     media: tuple[MediumEstimate, ...]  #: constants by medium
     terms: tuple[str, ...]  #: terms of the fit
     order: str  #: order of guide motion and insertion between samples
-    alternatives: Mapping[tuple[str, ...], float]  #: rms by terms, per axis [m]
     residuals: tuple[FloatArray, ...]  #: measured minus fitted tips, (samples, 2) [m]
     optima: int  #: number of distinct optima
     warnings: tuple[str, ...] = ()  #: warnings about the validity of the values

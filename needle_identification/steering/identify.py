@@ -13,12 +13,13 @@ terms:
               roll
 ============  =================================================================================
 
-Each recording has its own slope and path noise (`needle_identification.steering.mixed`), so that
-the readings of a recording are not independent. The search for the lengths starts from a grid
-(variable projection [Golub2003]_). Their intervals are profile likelihood intervals, in which the
-cause of drift and the order of motion are unknown as well: they contain all optima, causes and
-orders that fit alike. Their level is the one of Student's t; its degrees of freedom are
-from the scatter of the variances over the ratios [Satterthwaite1946]_.
+Their constants have priors, so that all causes are fitted together. Each recording has its own
+slope and path noise (`needle_identification.steering.mixed`), so that the readings of a recording
+are not independent. The search for the lengths starts from a grid (variable projection
+[Golub2003]_). Their intervals are profile likelihood intervals, in which the order of motion is
+unknown as well: they contain all optima and orders that fit alike. Their level is the one of
+Student's t; its degrees of freedom are from the scatter of the variances over the ratios
+[Satterthwaite1946]_.
 
 References
 ----------
@@ -29,7 +30,7 @@ References
 
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from math import exp, inf, isfinite, log1p, sqrt
@@ -49,6 +50,7 @@ from needle_identification.steering.estimate import (
 )
 from needle_identification.steering.mixed import MixedModel, variances
 from needle_identification.steering.recording import (
+    DEVIATIONS,
     NominalLayers,
     ORDERS,
     readings,
@@ -63,6 +65,7 @@ from needle_identification.steering.search import (
     Optimum,
     rms_of,
     Search,
+    searched,
     skin_of,
     Tips,
 )
@@ -76,14 +79,14 @@ _LEAST: Final = 1e-4  # least weight of a ratio of variances, for intervals and 
 #: Path noise that is reported [rad^2/m]: the path turns by 2 degrees in 0.1 m.
 _WANDERS: Final = 0.01
 _ROTATED: Final = 0.06  # rotation between frames that is reported [rad]
-_LARGEST: Final = 0.5  # largest error of a drift constant that is determined [rad or 1/m]
+_LARGEST: Final = 0.5  # largest error of a drift constant that is determined [prior deviations]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringSettings:
     """Settings of the steering identification."""
 
-    terms: tuple[str, ...] | None = None  #: drift terms; None selects the best
+    terms: tuple[str, ...] = tuple(TERMS)  #: causes of drift
     order: str | None = None  #: ``together`` or ``guide first``; None selects the better
     free_length: float | None = None  #: known free length [m]; None to estimate it
     #: Nominal needle in its tissue; if this has layers, the stiffness of each over its nominal one
@@ -91,7 +94,7 @@ class SteeringSettings:
     tissue: NeedleParameters | None = None
 
     def __post_init__(self) -> None:
-        for term in self.terms or ():
+        for term in self.terms:
             check_choice('terms', term, TERMS)
         if self.order is not None:
             check_choice('order', self.order, ORDERS)
@@ -151,22 +154,17 @@ def identify_steering(
     settings = settings or SteeringSettings()
     if not recordings:
         raise IdentificationError('no recordings to identify from')
-    sets = [(term,) for term in TERMS] if settings.terms is None else [settings.terms]
     orders = ORDERS if settings.order is None else (settings.order,)
     read = [readings(one) for one in recordings]
+    _check(read, 1 + len(settings.layers.starts))
     fits: list[_Fit] = []
-    with progress_of(progress, len(orders) * len(sets), 'fits') as advance:
+    with progress_of(progress, len(orders), 'fits') as advance:
         for order in orders:
-            tips, optima = Tips(read, order, settings.layers), list[Optimum]()
-            for terms in sets:
-                _check(read, terms, 1 + len(settings.layers.starts))
-                search = Search(tips, terms, settings.free_length)
-                # The lengths hardly depend on the drift terms.
-                optima = search.optima([one.x for one in optima])
-                fits.append(_Fit(search, optima))
-                advance()
-    best = min(fit.selection for fit in fits)
-    ranked = [fit._replace(gap=fit.selection - best) for fit in fits]
+            tips = Tips(read, order, settings.layers)
+            fits.append(_Fit(*searched(tips, settings.terms, settings.free_length)))
+            advance()
+    best = min(fit.optima[0].deviance for fit in fits)
+    ranked = [fit._replace(gap=fit.optima[0].deviance - best) for fit in fits]
     found = _estimate(sorted(ranked, key=lambda fit: fit.gap))
     return replace(found, tissue=settings.tissue)
 
@@ -174,22 +172,17 @@ def identify_steering(
 class _Fit(NamedTuple):
     search: Search
     optima: list[Optimum]
-    gap: float = 0.0  # selection minus that of the best fit
-
-    @property
-    def selection(self) -> float:
-        x = self.optima[0].x
-        apart = float(np.sum(self.search.apart(x) ** 2))
-        return sum(one.selection for one in self.search.fits(x)) + apart
+    gap: float = 0.0  # deviance minus that of the best fit
 
 
-def _check(recordings: Sequence[SteeringRecording], terms: tuple[str, ...], lengths: int) -> None:
+def _check(recordings: Sequence[SteeringRecording], lengths: int) -> None:
     for one in recordings:
         if not one.samples:
             raise IdentificationError(f'{one.name}: no valid sample of the tip')
     for medium in dict.fromkeys(one.medium for one in recordings):
         members = [one.samples for one in recordings if one.medium == medium]
-        unknown = lengths + 1 + 2 * len(members) + sum(len(TERMS[term]) for term in terms)
+        # The lengths, and offset and direction in each plane.
+        unknown = lengths + 1 + 2 * len(members) + 2
         if 2 * sum(members) <= unknown:
             raise IdentificationError(
                 f'{unknown} constants of {medium or "these recordings"} need more than '
@@ -206,7 +199,7 @@ def _refined(fit: _Fit) -> _Fit:
         penalties = -np.linalg.slogdet(spread)[1] * (len(model.depths) > 1)
         weights = one.weights * np.exp(-0.5 * (penalties - penalties.min()))
         kept = weights > _LEAST * weights.sum()
-        models.append(MixedModel(model.depths, model.ratios[kept], penalties[kept]))
+        models.append(MixedModel(model.depths, model.prior, model.ratios[kept], penalties[kept]))
     refined = Search(search.tips, search.terms, search.known, models)
     return fit._replace(search=refined, optima=refined.optima([one.x for one in fit.optima]))
 
@@ -214,9 +207,8 @@ def _refined(fit: _Fit) -> _Fit:
 def _freedom(search: Search, x: FloatArray) -> FloatArray:
     """Return the degrees of freedom (k,) of the variance of each variable (Satterthwaite)."""
     found = np.full(len(x), inf)
-    parts = zip(search.models, search.fits(x), search.spreads(x), strict=True)
-    for medium, (model, one, spread) in enumerate(parts):
-        known = model.freedom - len(one.drift) - search.width - 1
+    parts = zip(search.freedom(x), search.fits(x), search.spreads(x), strict=True)
+    for medium, (known, one, spread) in enumerate(parts):
         each = np.diagonal(spread, axis1=1, axis2=2)
         mean = one.weights @ each
         # The ratios of the deviations are uncertain, too.
@@ -228,19 +220,10 @@ def _freedom(search: Search, x: FloatArray) -> FloatArray:
 
 def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
     """Return the constants of the first fit, with the intervals of all that fit alike."""
-    order = ranked[0].search.tips.order
-    alternatives = {
-        fit.search.terms: rms_of(fit.search.residuals(fit.optima[0].x))
-        for fit in ranked
-        if fit.search.tips.order == order
-    }
     search, best = (first := _refined(ranked[0])).search, first.optima[0]
     fits, residuals = search.fits(best.x), search.residuals(best.x)
     information = search.information(best.x)
-    freedom = [
-        model.freedom - len(one.drift) - search.width - 1
-        for model, one in zip(search.models, fits, strict=True)
-    ]
+    freedom = search.freedom(best.x)
     rises = [
         log1p(stdtrit(free, 0.975) ** 2 / free) * (free + 1.0)
         for free in _freedom(search, best.x).tolist()
@@ -310,10 +293,9 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
         media=tuple(media),
         terms=search.terms,
         order=search.tips.order,
-        alternatives=alternatives,
         residuals=tuple(residuals),
         optima=len(first.optima),
-        warnings=tuple(_warnings(alike, min(rises), alternatives, media)),
+        warnings=tuple(_warnings(alike, min(rises), media)),
     )
 
 
@@ -335,10 +317,12 @@ def _drift(
         (search.fits(there)[medium].drift - values) / step for step, there in search.steps(best.x)
     ]
     covariance += np.transpose(slopes) @ best.spread @ np.array(slopes)
-    names = [name for term in search.terms for name in TERMS[term]]
-    for name, value, variance in zip(names, values.tolist(), np.diag(covariance), strict=True):
+    names = [(name, DEVIATIONS[term]) for term in search.terms for name in TERMS[term]]
+    for (name, prior), value, variance in zip(
+        names, values.tolist(), np.diag(covariance), strict=True
+    ):
         error = sqrt(variance)
-        half = quantile * error if error < _LARGEST else inf
+        half = quantile * error if error < _LARGEST * prior else inf
         yield _constant(name, value, error, value - half, value + half)
 
 
@@ -354,25 +338,12 @@ def _constant(
 
 
 def _warnings(
-    alike: Sequence[_Fit],
-    rise: float,
-    alternatives: Mapping[tuple[str, ...], float],
-    media: Sequence[MediumEstimate],
+    alike: Sequence[_Fit], rise: float, media: Sequence[MediumEstimate]
 ) -> Iterator[str]:
     """Warn of fits that the recordings cannot distinguish, and of poor predictions."""
     search, optima = alike[0].search, alike[0].optima
     # The interval of a constant that is hardly determined contains more fits.
     alike = [fit for fit in alike if fit.gap < rise]
-    equal = [fit.search.terms for fit in alike if fit.search.tips.order == search.tips.order]
-    if len(equal) > 1:
-        each = ', '.join(
-            f'{"+".join(terms)} {1e3 * alternatives[terms]:.3f} mm' for terms in equal
-        )
-        yield (
-            f'these explain the drift equally well (rms: {each}); all of it is attributed to '
-            f'{"+".join(search.terms)}. A motion of the guide in air identifies the frame, a '
-            'rotation of the needle at half the depth identifies the bevel'
-        )
     if any(fit.search.tips.order != search.tips.order for fit in alike):
         yield (
             'guide and needle may move together or one after the other: both fit alike, and the '
@@ -386,8 +357,16 @@ def _warnings(
             for _, length, skin, *_ in search.lengths(one.x)
         )
         yield f'{len(near)} sets of lengths fit alike, the intervals contain all: lambda {each}'
+    names = {name for term in search.terms for name in TERMS[term]}
     for one in media:
         name = one.medium or 'these recordings'
+        unknown = [each.name for each in one.parameters if not each.determined]
+        if unknown := [each for each in unknown if each in names]:
+            yield (
+                f'{name}: the causes of drift are not known apart ({", ".join(unknown)} have '
+                'probable values). A motion of the guide in air identifies the frame, a rotation '
+                'of the needle at half the depth identifies the bevel'
+            )
         if one.held_out is not None and one.held_out.rms > _WORSE * one.rms:
             yield (
                 f'{name}: a recording is predicted from the others with an error of '

@@ -6,20 +6,22 @@ In each plane of each recording, the tip minus its response to the guide is
 
 .. math:: X \beta + o + s d + w(d) + v(g) + e
 
-with the drift of the medium, an offset o, a slope s ~ N(0, tau^2) with the depth d, the path
-noise w, an integrated Wiener process of intensity q, the error v of the response to the guide g,
-whose variance grows with its travel, and white noise e of deviation sigma. The likelihood is
-restricted [Harville1974]_: o, beta and sigma are integrated out. The ratios of the other
-deviations to sigma are summed over a grid: a few recordings hardly determine them. A penalty for
-each ratio integrates the lengths in the response out, in the approximation of [Cox1987]_:
-otherwise the lengths of a few recordings are those with the least difference between recordings.
+with the drift constants of the medium :math:`\beta`, which are normal with known deviations, an
+offset o, a slope s ~ N(0, tau^2) with the depth d, the path noise w, an integrated Wiener process
+of intensity q, the error v of the response to the guide g, whose variance grows with its travel,
+and white noise e of deviation sigma. All causes of drift are possible at once; without a prior
+[Harville1977]_ they would not be determined together. The offset and sigma are integrated out. The
+ratios of the other deviations to sigma are summed over a grid: a few recordings hardly determine
+them. A penalty for each ratio integrates the lengths in the response out, in the approximation of
+[Cox1987]_: otherwise the lengths of a few recordings are those with the least difference between
+recordings.
 
 References
 ----------
 .. [Cox1987] D. R. Cox, N. Reid, "Parameter orthogonality and approximate conditional inference",
    Journal of the Royal Statistical Society B 49(1), 1987.
-.. [Harville1974] D. A. Harville, "Bayesian inference for variance components using only error
-   contrasts", Biometrika 61, 1974.
+.. [Harville1977] D. A. Harville, "Maximum likelihood approaches to variance component estimation
+   and to related problems", Journal of the American Statistical Association 72(358), 1977.
 
 """
 
@@ -40,19 +42,19 @@ _SLOPES: Final = (0.0, 2.0, 8.0, 32.0, 128.0)
 _RESPONSES: Final = (0.0, 0.5, 2.0, 8.0)
 
 _FINEST: Final = 1e-6  # smallest deviation of the white noise [m]
-_WEAK: Final = 1e-4  # noise for which constants without effect are 0 +- 1 rad or 1/m [m]
 
 
 class Likelihood(NamedTuple):
     """Fit at given lengths: K ratios, c drift constants and N residuals."""
 
-    deviance: float  #: -2 log restricted likelihood
-    selection: float  #: -2 log likelihood, with a penalty of 2 for each constant
+    deviance: float  #: -2 log likelihood
     weights: FloatArray  #: (K,) posterior probabilities of the ratios
     variances: FloatArray  #: (K,) of the white noise [m^2]
     values: FloatArray  #: (K, c) drift constants
     covariances: FloatArray  #: (K, c, c) of the drift constants
-    residuals: FloatArray  #: (K, N) residuals, whitened to the variance of the white noise [m]
+    #: (K, N) residuals, whitened to the variance of the white noise, and those of the prior [m].
+    residuals: FloatArray
+    known: float  #: effective number of drift constants that the tips determine
 
     @property
     def drift(self) -> FloatArray:
@@ -64,12 +66,14 @@ class MixedModel:
     """
     Covariances of the recordings of a medium, by depth and guide (n, 3) of their readings.
 
-    Twice the log likelihood of each ratio is less by its penalty.
+    ``prior`` is sigma over the deviation of each drift constant, (c,). Twice the log likelihood of
+    each ratio is less by its penalty.
     """
 
     def __init__(
         self,
         depths: Sequence[FloatArray],
+        prior: FloatArray,
         ratios: FloatArray | None = None,
         penalties: FloatArray | float = 0.0,
     ) -> None:
@@ -78,21 +82,19 @@ class MixedModel:
             slopes = _SLOPES if len(depths) > 1 else (0.0,)
             ratios = np.array(list(product(_WANDERS, slopes, _RESPONSES)))
         self.ratios, self.depths, self.penalties = ratios, depths, penalties
-        self.samples = 2 * sum(map(len, depths))
-        self.freedom = self.samples - 2 * len(depths)  #: samples minus offsets
-        # The contrasts are normalized by white noise, the last ratios.
-        each = [*ratios, np.zeros(3)]
+        self.prior = prior
+        #: Samples minus offsets.
+        self.freedom = 2 * (sum(map(len, depths)) - len(depths))
         rows = max(map(len, depths))
-        self._half = np.zeros((len(each), len(depths), rows, rows))
-        self._logs = np.zeros(len(each))
-        for k, ratio in enumerate(each):
+        self._half = np.zeros((len(ratios), len(depths), rows, rows))
+        self._logs = penalties - 2.0 * np.log(prior).sum() + np.zeros(len(ratios))
+        for k, ratio in enumerate(ratios):
             unique = {depth.tobytes(): depth for depth in depths}
             known = {key: _whitening(covariance(one, ratio)) for key, one in unique.items()}
             for i, depth in enumerate(depths):
                 half, log = known[depth.tobytes()]
                 self._half[k, i, : len(half), : len(half)] = half
                 self._logs[k] += 2.0 * log
-        self._logs[:-1] += penalties
 
     def likelihood(
         self, columns: Sequence[FloatArray], wanted: Sequence[FloatArray]
@@ -106,25 +108,28 @@ class MixedModel:
         # One product for both planes.
         planes = both.reshape(*both.shape[:2], -1)
         rows = (self._half @ planes).reshape(len(self._half), -1, c + 1)
+        # The prior is a reading of 0 of each constant.
+        prior = np.zeros((len(rows), c, c + 1))
+        prior[:, range(c), range(c)] = self.prior
+        rows = np.concatenate([rows, prior], axis=1)
         design, tips = rows[..., :c], rows[..., c]
-        normal = np.swapaxes(design, 1, 2) @ design + _WEAK**2 * np.eye(c)
+        normal = np.swapaxes(design, 1, 2) @ design
         inverse = np.linalg.inv(normal)
         values = (inverse @ np.swapaxes(design, 1, 2) @ tips[..., np.newaxis])[..., 0]
         left = tips - (design @ values[..., np.newaxis])[..., 0]
-        free = self.freedom - c
-        variances = np.einsum('kn,kn->k', left, left) / free + _FINEST**2
-        logs = np.linalg.slogdet(normal)[1]
-        each = free * np.log(variances) + self._logs + logs - logs[-1]
-        whole = self.samples * np.log(variances) + self._logs + 2.0 * c
-        total = logsumexp(-0.5 * each[:-1])
+        variances = np.einsum('kn,kn->k', left, left) / self.freedom + _FINEST**2
+        each = self.freedom * np.log(variances) + self._logs + np.linalg.slogdet(normal)[1]
+        total = logsumexp(-0.5 * each)
+        weights = np.exp(-0.5 * each - total)
+        unknown = np.diagonal(inverse, axis1=1, axis2=2) @ self.prior**2
         return Likelihood(
             deviance=-2.0 * float(total),
-            selection=-2.0 * float(logsumexp(-0.5 * whole[:-1])),
-            weights=np.exp(-0.5 * each[:-1] - total),
-            variances=variances[:-1],
-            values=values[:-1],
-            covariances=(variances[:, np.newaxis, np.newaxis] * inverse)[:-1],
-            residuals=left[:-1],
+            weights=weights,
+            variances=variances,
+            values=values,
+            covariances=variances[:, np.newaxis, np.newaxis] * inverse,
+            residuals=left,
+            known=c - float(weights @ unknown),
         )
 
 

@@ -35,6 +35,10 @@ TERMS: Final = {
     'bevel': ('curvature_z', 'curvature_x'),
 }
 
+#: Prior standard deviation of the constants of each term, as of the steering controller, whose
+#: bevel load of 0.3 N bends a long needle in a gel by 0.5 1/m [rad or 1/m].
+DEVIATIONS: Final = {'tilt': 0.04, 'frame': 0.06, 'bevel': 0.5}
+
 #: Longest element [m]: accurate to a micrometer, and equal for all bending lengths, so that the
 #: responses are smooth functions of them.
 _ELEMENT: Final = 1.5e-3

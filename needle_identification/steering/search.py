@@ -10,10 +10,12 @@ from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.steering.estimate import HeldOut
 from needle_identification.steering.mixed import covariance, Likelihood, MixedModel
 from needle_identification.steering.recording import (
+    DEVIATIONS,
     drift,
     NominalLayers,
     SimulatedCauses,
     SteeringRecording,
+    TERMS,
     TipResponses,
     UNIFORM,
 )
@@ -44,6 +46,8 @@ _ROLLED: Final = 0.1  # roll that excites the bevel [rad]
 _NOTHING: Final = 1e-4  # weight of a ratio without effect on a search
 _APART: Final = 0.05  # least difference between the variables of different optima
 _NEAR: Final = 0.02  # relative tolerance of the ends of intervals
+
+_NOISE: Final = 1e-4  # noise of a reading before the first fit [m]
 
 _START: Final = 0.015  # depth of the measurements that determine offset and slope [m]
 _ANY: Final = 1.0  # standard deviation of the offset [m]
@@ -101,9 +105,7 @@ class Search:
             medium: [k for k, other in enumerate(media) if other == medium]
             for medium in dict.fromkeys(media)
         }
-        self.models = models or [
-            MixedModel([tips.moved[at] for at in members]) for members in self.members.values()
-        ]
+        self.models = models or self.models_for([_NOISE] * len(self.members))
         ends = zip(FREE, LENGTH, SKIN, strict=True)
         self.bounds = np.array([self.variables(*end, len(self.members)) for end in ends])
         #: Length of the longest interval of each variable that is determined.
@@ -114,6 +116,14 @@ class Search:
                 self.bounds[:, of_layers] = np.log(LENGTH)[:, np.newaxis]
                 self.ranges[of_layers] = _KNOWN
         self._part = lru_cache(maxsize=64)(self._fit)
+
+    def models_for(self, noises: Sequence[float]) -> list[MixedModel]:
+        """Return the model of each medium for the noise of its readings [m]."""
+        deviations = [DEVIATIONS[term] for term in self.terms for _ in TERMS[term]]
+        return [
+            MixedModel([self.tips.moved[at] for at in members], noise / np.array(deviations))
+            for noise, members in zip(noises, self.members.values(), strict=True)
+        ]
 
     def variables(self, free: float, length: float, skin: float, media: int = 1) -> FloatArray:
         """Return the search variables for the same lengths [m] of all media."""
@@ -231,6 +241,13 @@ class Search:
         begin = first + self.width * medium
         return [*range(first), *range(begin, begin + self.width)]
 
+    def freedom(self, x: FloatArray) -> list[float]:
+        """Return the degrees of freedom of the white noise of each medium."""
+        return [
+            max(model.freedom - one.known - self.width - 1, 1.0)
+            for model, one in zip(self.models, self.fits(x), strict=True)
+        ]
+
     def spreads(self, x: FloatArray) -> list[FloatArray]:
         """Return the covariances (K, k, k) of the variables of each medium, by ratio."""
         changed = [(step, self.fits(there)) for step, there in self.steps(x)]
@@ -298,6 +315,17 @@ class Search:
                 trials.append((total, x))
             starts.append(min(trials, key=lambda one: one[0])[1])
         return starts
+
+
+def searched(
+    tips: Tips, terms: tuple[str, ...], free: float | None
+) -> tuple[Search, list[Optimum]]:
+    """Return a search and its optima, with priors relative to the noise of the fit before."""
+    search = Search(tips, terms, free)
+    optima = search.optima()
+    noises = [sqrt(float(one.weights @ one.variances)) for one in search.fits(optima[0].x)]
+    search = Search(tips, terms, free, search.models_for(noises))
+    return search, search.optima([one.x for one in optima])
 
 
 def skin_of(variable: float) -> float:
@@ -370,7 +398,7 @@ def held_out(search: Search, best: Optimum, medium: int) -> HeldOut | None:
         models = list(search.models)
         depths = [*models[medium].depths[:k], *models[medium].depths[k + 1 :]]
         whole = models[medium]
-        models[medium] = MixedModel(depths, whole.ratios, whole.penalties)
+        models[medium] = MixedModel(depths, whole.prior, whole.ratios, whole.penalties)
         tips = Tips(others, search.tips.order, search.tips.layers)
         fitted = Search(tips, search.terms, search.known, models)
         found.append(predict(search, fitted, fitted.descend(best.x), medium, at))

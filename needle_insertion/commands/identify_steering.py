@@ -66,7 +66,7 @@ def add_steering(what: Any) -> None:
     fitting.add_argument(
         '--terms',
         metavar='TERM,...',
-        help=f'causes of drift, from {", ".join(TERMS)} (default: the most likely cause)',
+        help=f'causes of drift, from {", ".join(TERMS)} (default: all)',
     )
     fitting.add_argument(
         '--order',
@@ -123,7 +123,7 @@ def _run(options: argparse.Namespace) -> int:
     from needle_identification.result import steering_yaml
 
     common.check_file(options.output)
-    terms = options.terms and tuple(common.words_of(options.terms))
+    terms = tuple(common.words_of(options.terms or ','.join(TERMS)))
     name, tissue = _nominal(options)
     settings = SteeringSettings(
         terms=terms, order=options.order, free_length=options.free_length, tissue=tissue
@@ -202,9 +202,6 @@ def steering_text(found: SteeringEstimate) -> str:
         )
         for medium in found.media
     ]
-    others = ', '.join(
-        f'{"+".join(terms)} {1e3 * rms:.3f} mm' for terms, rms in found.alternatives.items()
-    )
     layers = ', '.join(
         f'{one["stiffness"]:.4g} N/m^2 from {1e3 * one["depth"]:g} mm' for one in _layers(found)
     )
@@ -215,7 +212,7 @@ def steering_text(found: SteeringEstimate) -> str:
             '',
             table(fits, _FITS),
             '',
-            f'drift by {"+".join(found.terms)}; rms by cause: {others}; guide and needle {motion}',
+            f'drift by {", ".join(found.terms)}; guide and needle {motion}',
             *([f'k_nominal: {layers}'] if layers else []),
         ]
     )
@@ -258,7 +255,6 @@ def steering_document(
         'terms': list(found.terms),
         'order': found.order,
         'optima': found.optima,
-        'rms_by_terms': {'+'.join(terms): rms for terms, rms in found.alternatives.items()},
         'recordings': [
             {'name': one.name, 'medium': one.medium, 'losses': list(one.losses)}
             for one in recordings
