@@ -242,8 +242,9 @@ def _reversals(regime: FloatArray, longest: int) -> tuple[BoolArray, BoolArray]:
     sign = regime[starts]
     turning, begins = np.zeros((2, len(regime)), dtype=np.bool_)
     begins[starts[1:][sign[1:] * sign[:-1] < 0.0]] = True
+    # Between opposite signs is a rest.
     for k in np.flatnonzero(sign[2:] * sign[:-2] < 0.0) + 1:
-        if sign[k] == 0.0 and ends[k] - starts[k] <= longest:
+        if ends[k] - starts[k] <= longest:
             turning[starts[k] : ends[k]] = True
             begins[[starts[k], ends[k]]] = True
     return turning, begins

@@ -94,6 +94,8 @@ class SteeringSettings:
     tissue: NeedleParameters | None = None
 
     def __post_init__(self) -> None:
+        if not self.terms:
+            raise ParameterError(f'terms must be at least one of {", ".join(TERMS)}')
         for term in self.terms:
             check_choice('terms', term, TERMS)
         if self.order is not None:

@@ -65,6 +65,7 @@ def add_steering(what: Any) -> None:
     fitting = parser.add_argument_group('identification')
     fitting.add_argument(
         '--terms',
+        default=','.join(TERMS),
         metavar='TERM,...',
         help=f'causes of drift, from {", ".join(TERMS)} (default: all)',
     )
@@ -123,7 +124,7 @@ def _run(options: argparse.Namespace) -> int:
     from needle_identification.result import steering_yaml
 
     common.check_file(options.output)
-    terms = tuple(common.words_of(options.terms or ','.join(TERMS)))
+    terms = tuple(common.words_of(options.terms))
     name, tissue = _nominal(options)
     settings = SteeringSettings(
         terms=terms, order=options.order, free_length=options.free_length, tissue=tissue

@@ -425,6 +425,7 @@ def test_invalid_input_is_reported() -> None:
         replace(short, depth=np.array([0.0, -0.01, 0.0]))
     for wrong, words in (
         ({'terms': ('wind',)}, "terms must be one of tilt, frame, bevel, got 'wind'"),
+        ({'terms': ()}, 'terms must be at least one of tilt, frame, bevel'),
         ({'order': 'never'}, 'order must be one of together, guide first'),
         ({'free_length': 2.0}, r'free_length must be in \[0.001, 0.3\] m, got 2.0'),
     ):

@@ -77,7 +77,7 @@ def test_cleanup_and_shutdown_destroy_what_was_created(
 def test_destroyed_timer_is_not_called(ros_graph: RosGraph) -> None:
     """Not even if it is due already: a socket, for example, would be opened again."""
     node, late = ros_graph.add(PlantNode, start=False), []
-    # Without the override, 20 of 50 rounds call a destroyed timer.
+    # Without the override, 23 of 1000 destroyed timers are called.
     for _ in range(50):
         calls: list[int] = []
         timers = [steady_timer(node, 1e-3, partial(calls.append, one)) for one in range(20)]
