@@ -77,6 +77,9 @@ WORDS: Final = {
     'quit': ('', 'end the nodes and complete the recording'),
 }
 
+#: Period of the checks of a condition [s]. After each event of /clock, messages would be too late.
+_PERIOD: Final = 0.02
+
 _GRACE: Final = 5.0  #: Time at the start in which nodes wait for each other [s].
 
 
@@ -156,7 +159,7 @@ class Terminal(Cmd):
         """Stop the needle by the nodes that still run; wait until it rests, or for a timeout."""
         self._operator.ask('stop')
         with suppress(GraphError):
-            self._graph.spin_until(lambda: self.rests, 'rest', _BRAKING)
+            self._graph.spin_until(lambda: self.rests, 'rest', _BRAKING, period=_PERIOD)
 
     def next_line(self) -> str | None:
         """Wait for the next line, None at the end; raise `GraphError` if a node ends."""
@@ -195,7 +198,7 @@ class Terminal(Cmd):
             self._print_warnings()
             return condition()
 
-        self._graph.spin_until(holds, what, timeout)
+        self._graph.spin_until(holds, what, timeout, period=_PERIOD)
 
     def _await(self, condition: Callable[[], Any], what: str, *, brief: bool = True) -> None:
         """Wait while a person can type: a stop ends the wait, or any line if it is not `brief`."""

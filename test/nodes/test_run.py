@@ -19,8 +19,16 @@ import time
 from needle_controller.steering.insertion_plan import write_plan
 from needle_dynamics.plant_node import PlantNode
 from needle_identification.bags.bag import read_topic
+from needle_insertion.graph.ros_graph import Graph
+from needle_insertion.live.operator import Operator
+from needle_insertion.live.readings import Readings
+from needle_insertion.live.screen import Screen
+from needle_insertion.live.terminal import Terminal, Warnings
 from needle_insertion.replay.rerun import verify
 import pytest
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Header
 from support.installed import ROOT
 from support.plans import bowed_plan
 from support.ros_graph import RosGraph
@@ -493,3 +501,31 @@ def test_plan_that_cannot_be_run_is_rejected_by_a_line(
     assert status == 2
     assert message in errors
     assert len(errors.splitlines()) == 1
+
+
+def test_status_does_not_wait_for_a_check_after_each_message(tmp_path: Path) -> None:
+    """A fast clock would delay the status of nodes by seconds, until messages are lost."""
+    with Graph(tmp_path) as graph:
+        node, count = graph.node('operator'), 500
+        status: list[Header] = []
+        qos = QoSProfile(depth=count)
+        node.create_subscription(Header, 'fast', lambda _: None, qos)
+        node.create_subscription(Header, 'status', status.append, qos)
+        fast, late = (node.create_publisher(Header, name, qos) for name in ('fast', 'status'))
+        readings, screen = Readings(Node('readings', context=graph.context)), Screen()
+        terminal = Terminal(graph, Operator(node), readings, screen, Warnings(screen.say))
+        # The executor must have installed its listeners: each message is an event of its own.
+        graph.executor.spin_once(timeout_sec=0.1)
+        for _ in range(count):
+            fast.publish(Header())
+        late.publish(Header())
+        begin, checks = time.monotonic(), 0
+
+        def has_arrived() -> bool:
+            nonlocal checks
+            checks += 1
+            return bool(status)
+
+        terminal._spin_until(has_arrived, 'the status', _LONGEST)
+        # One check in 20 ms, and the first and last.
+        assert checks <= (time.monotonic() - begin) / 0.02 + 2
