@@ -21,6 +21,7 @@ extensions = [
     'progress',
     'api',
     'repository_pages',
+    'sidebar',
     'safety_file',
     'mathml',
     'sphinx_gallery.gen_gallery',
