@@ -24,18 +24,30 @@ settings.register_profile('random', deadline=None, derandomize=False)
 settings.load_profile('tests')
 
 #: Files whose tests share expensive fixtures, or need most of a machine: each file runs in one
-#: process.
-WHOLE = {
-    'test/bench/test_graph.py',
-    'test/bench/test_calibration.py',
-    'test/composition/test_claims.py',
-    'test/composition/test_experiment.py',
-    'test/composition/test_reproduce.py',
-    'test/nodes/test_package.py',
-    'test/nodes/test_strangers.py',
-    'test/test_layouts.py',
+#: process. The runs of the reproduction are computed once for all files that use them.
+WHOLE: Final = {
+    **dict.fromkeys(
+        (
+            'test/composition/test_claims.py',
+            'test/composition/test_figures.py',
+            'test/composition/test_mismatch.py',
+            'test/composition/test_reproduce.py',
+        ),
+        'reproduction',
+    ),
+    **{
+        file: file
+        for file in (
+            'test/bench/test_graph.py',
+            'test/bench/test_calibration.py',
+            'test/composition/test_experiment.py',
+            'test/composition/test_plan_page.py',
+            'test/nodes/test_package.py',
+            'test/nodes/test_strangers.py',
+            'test/test_layouts.py',
+        )
+    },
 }
-
 
 #: Multiple of the time limit after which the process of a hanging test is killed.
 LAST: Final = 1.5
@@ -159,8 +171,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class Scheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            file = nodeid.partition('::')[0]
-            return file if file in WHOLE else nodeid
+            return WHOLE.get(nodeid.partition('::')[0], nodeid)
 
         def schedule(self) -> None:
             """Assign two units to each process: a test starts only with the next one queued."""

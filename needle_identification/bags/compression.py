@@ -36,7 +36,7 @@ LARGEST_RECORD: Final = 2**27  #: largest record or chunk [bytes]
 LARGEST_MESSAGE: Final = 2**26  #: largest message that was compressed individually [bytes]
 _AT_LEAST: Final = 2**28  # decompressed size allowed for any file [bytes]
 _RATIO: Final = 50  # decompressed size allowed per byte of a file
-_RECORDS: Final = 2**20  # records allowed for any file, else one per byte
+_RECORDS: Final = 2**18  # records allowed for any file, else one per byte
 COSTLY: Final = 8  #: number of records as which a chunk, a definition, an index counts
 
 

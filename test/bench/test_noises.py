@@ -36,7 +36,7 @@ def test_colored_noise_has_configured_correlation_time(name: str) -> None:
 
 
 def test_table_has_row_for_each_noise_and_bars() -> None:
-    sections, bars = noises.compare(print, recordings=4, seed=1)
+    sections, bars = noises.compare(print, recordings=2, seed=1)
     assert [[row[0] for row in one.rows] for one in sections] == [list(LINES), list(FURTHER)]
     figures = {bar.figure: bar for bar in bars}
     assert figures['largest share of false advice'].limit == 2.0

@@ -215,7 +215,7 @@ def test_prediction_of_a_recording_that_is_not_fitted(recordings: list[SteeringR
 def test_command_prints_tables_and_writes_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _folder(tmp_path, range(4))
+    _folder(tmp_path, range(2))
     output = tmp_path / 'found.json'
     main([str(tmp_path), '-o', str(output)])
     printed = capsys.readouterr().out

@@ -45,13 +45,13 @@ def test_report_has_all_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     along.write_text(yaml.safe_dump(ALONG))
     monkeypatch.setattr(bench_study, 'STUDY', file)
     monkeypatch.setattr(bench_study, 'AXIS', along)
-    monkeypatch.setitem(bench_study.PLANS, 'quick', StudyPlan(400, 100, 1, (10, 20, 40), 2, 3))
+    monkeypatch.setitem(bench_study.PLANS, 'quick', StudyPlan(64, 32, 1, (4, 8, 16), 1, 2))
     told: list[str] = []
     [rates, axial, memory, tables], bars = bench_study.compare(told.append, 'quick')
     assert [row[0] for row in rates.rows] == list(bench_study.WAYS)
     for _, together, each, *_ in (*rates.rows, *axial.rows):
         assert float(together) >= float(each) > 0.0
-    assert [row[0] for row in memory.rows] == ['10', '20', '40']
+    assert [row[0] for row in memory.rows] == ['4', '8', '16']
     # Memory of a process with NumPy and Numba.
     assert all(50.0 < float(peak) < 2000.0 for row in memory.rows for peak in row[2:])
     assert len({row[1] for row in tables.rows}) == 1
@@ -62,7 +62,7 @@ def test_report_has_all_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert found['tables along the axis that differ'].found == 0.0
     assert found['insertions computed twice'].found == 0.0
     assert found['closed loop, per second and core'].limit == 200.0
-    assert 'peak of parent, 40 over 20 insertions' in found
+    assert 'peak of parent, 16 over 8 insertions' in found
     assert 'the study is killed' in told
 
 

@@ -373,7 +373,7 @@ def test_table_is_independent_of_workers_and_chunks(tmp_path: Path) -> None:
 
 
 def test_killed_workers_do_not_change_the_table(tmp_path: Path) -> None:
-    """Six workers are killed at random times, most during their start; no process hangs."""
+    """Four workers are killed at random times, most during their start; no process hangs."""
     document = {**SMALL, 'samples': 600}
     file, folder = tmp_path / 'study.yaml', tmp_path / 'killed'
     file.write_text(yaml.safe_dump(document))
@@ -381,22 +381,22 @@ def test_killed_workers_do_not_change_the_table(tmp_path: Path) -> None:
     compute(whole, here, 1, lambda _: None)
     words = [sys.executable, '-m', 'needle_insertion.cli', 'study', str(file), '--workers', '2']
     # Up to 2 s between kills, about the time until a worker starts its first chunk.
-    losses = kill_workers([*words, '-o', str(folder)], folder, 6, 2.0, np.random.default_rng(1))
+    losses = kill_workers([*words, '-o', str(folder)], folder, 4, 2.0, np.random.default_rng(1))
     assert losses.killed >= 2
     assert (losses.errors, losses.hangs) == (0, 0)
     assert checksum(folder / 'samples.parquet') == checksum(whole.table)
 
 
 def test_killed_studies_are_resumed(tmp_path: Path) -> None:
-    """Ten kills with SIGKILL; no chunk is computed twice, and the table is the same."""
-    document = {**SMALL, 'samples': 1500, 'settings': {**SMALL['settings'], 'step_length': 0.005}}
+    """Four kills with SIGKILL; no chunk is computed twice, and the table is the same."""
+    document = {**SMALL, 'samples': 600, 'settings': {**SMALL['settings'], 'step_length': 0.005}}
     file = tmp_path / 'study.yaml'
     file.write_text(yaml.safe_dump(document))
     words = [sys.executable, '-m', 'needle_insertion.cli', 'study', str(file), '--workers', '1']
     folder, rng = tmp_path / 'killed', np.random.default_rng(1)
     whole = Results(tmp_path / 'whole', build_study(document))
     compute(whole, here, 1, lambda _: None)
-    kills = kill_again_and_again([*words, '-o', str(folder)], folder, 10, rng)
+    kills = kill_again_and_again([*words, '-o', str(folder)], folder, 4, rng)
     assert kills.killed >= 2
     assert kills.twice == 0
     assert kills.left == 0
@@ -531,7 +531,7 @@ def test_intervals_of_sobol_indices_hold(
 ) -> None:
     """Of 95 %, alone and with interactions, without noise and with noise as one more variable."""
     alone, together, variance = known
-    count, d = 200, len(alone)
+    count, d = 100, len(alone)
     whole = (1.0 + noise) * variance
     true = np.array([[noise * variance, *alone], [noise * variance, *together]]) / whole
     held = np.zeros(true.shape)
@@ -549,7 +549,7 @@ def test_intervals_of_sobol_indices_hold(
         for k, one in enumerate(found.values()):
             for row, estimate in enumerate(one):
                 held[row, k] += estimate.low <= true[row, k] <= estimate.high
-    # Three standard errors of 200 intervals; indices of 0 are at an end of their interval.
+    # Three standard errors of 100 intervals; indices of 0 are at an end of their interval.
     inside = held[(true > 0.0) & (true < 1.0)] / count
     assert inside.min() > 0.95 - 3.0 * sqrt(0.95 * 0.05 / count)
     assert 0.93 < inside.mean() < 0.99

@@ -299,6 +299,9 @@ def environment(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pip = (sys.executable, '-m', 'pip', '--python', python)
     installed = shell(folder, *pip, 'install', *options, archive)
     assert installed.returncode == 0, installed.stdout + installed.stderr
+    # Machine code of this checkout: its compilation is tested elsewhere.
+    code = Path('needle_dynamics/compiled/__pycache__')
+    shutil.copytree(ROOT / code, places['purelib'] / code, dirs_exist_ok=True)
     return folder / 'venv'
 
 
