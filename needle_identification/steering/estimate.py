@@ -45,7 +45,8 @@ class HeldOut(NamedTuple):
 
     rms: float  #: root mean square beyond the first depths, which determine the offset [m]
     interval: tuple[float, float]  #: 95 % interval of the rms [m]
-    coverage: float  #: fraction of tips within their predicted 95 % interval
+    #: Fraction of tips within their 95 % interval, whose width is from the errors of the others.
+    coverage: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

@@ -6,7 +6,7 @@ from functools import lru_cache, partial
 from math import copysign, exp, inf, log, sqrt
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import BoolArray, FloatArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.steering.estimate import HeldOut
 from needle_identification.steering.mixed import covariance, Likelihood, MixedModel
 from needle_identification.steering.recording import (
@@ -380,14 +380,14 @@ def _end(
 
 
 class Prediction(NamedTuple):
-    """Measured minus predicted tips beyond the first depths, and whether they are expected."""
+    """Measured minus predicted tips beyond the first depths, and their standard deviations."""
 
     errors: FloatArray  # (n, 2) [m]
-    held: BoolArray  # (n, 2) within the 95 % interval
+    deviations: FloatArray  # (n, 2) [m]
 
 
 def held_out(search: Search, best: Optimum, medium: int) -> HeldOut | None:
-    """Predict each recording of a medium from all others; None for a single recording."""
+    """Predict each recording of a medium from all others; None for fewer than two."""
     members = list(search.members.values())[medium]
     if len(members) < 2:
         return None
@@ -402,10 +402,27 @@ def held_out(search: Search, best: Optimum, medium: int) -> HeldOut | None:
         tips = Tips(others, search.tips.order, search.tips.layers)
         fitted = Search(tips, search.terms, search.known, models)
         found.append(predict(search, fitted, fitted.descend(best.x), medium, at))
+    found = [one for one in found if len(one.errors)]
+    if len(found) < 2:
+        return None
+    # The errors along a path are alike: each recording has one error in each plane.
     rms, freedom = rms_of([one.errors for one in found]), 2 * len(found)
     low, high = (rms * sqrt(freedom / float(chdtri(freedom, p))) for p in (0.025, 0.975))
-    coverage = float(np.mean(np.concatenate([one.held for one in found])))
-    return HeldOut(rms=rms, interval=(low, high), coverage=coverage)
+    held = np.concatenate(
+        [
+            np.abs(one.errors) <= reach * one.deviations
+            for one, reach in zip(found, reaches(found), strict=True)
+        ]
+    )
+    return HeldOut(rms=rms, interval=(low, high), coverage=float(np.mean(held)))
+
+
+def reaches(found: Sequence[Prediction]) -> FloatArray:
+    """Return the 95 % intervals over the deviations, (r,), by the errors of the others."""
+    # A wrong model, not only its constants, makes errors that exceed their deviations.
+    squares = np.array([np.sum(np.mean((e / d) ** 2, axis=0)) for e, d in found])
+    freedom = 2.0 * (len(found) - 1)
+    return np.asarray(stdtrit(freedom, 0.975) * np.sqrt((squares.sum() - squares) / freedom))
 
 
 def predict(search: Search, fitted: Search, best: Optimum, medium: int, at: int) -> Prediction:
@@ -431,11 +448,8 @@ def predict(search: Search, fitted: Search, best: Optimum, medium: int, at: int)
         square = mean**2 + np.diag(total)[rest]
         square -= np.einsum('ij,ji->i', gain, total[np.ix_(first, rest)])
         means, squares = means + weight * mean, squares + weight * square
-    # The errors along a path are alike: each fitted recording has one error in each plane.
-    freedom = max(1, 2 * len(fitted.models[medium].depths) - len(fit.drift))
-    half = stdtrit(freedom, 0.975) * np.sqrt(squares - means**2)
-    held = np.abs(means) <= half
-    return Prediction(means.reshape(2, -1).T, held.reshape(2, -1).T)
+    deviations = np.sqrt(squares - means**2)
+    return Prediction(means.reshape(2, -1).T, deviations.reshape(2, -1).T)
 
 
 def rms_of(errors: Sequence[FloatArray]) -> float:

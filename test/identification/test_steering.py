@@ -24,6 +24,7 @@ from needle_identification.result import steering_yaml
 from needle_identification.steering.mixed import covariance, MixedModel
 from needle_identification.steering.reading import STEERING_ROLES
 from needle_identification.steering.recording import credible, readings
+from needle_identification.steering.search import Prediction, reaches
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -253,6 +254,20 @@ def test_intervals_contain_the_differences_between_insertions() -> None:
     assert gel.held_out is not None
     # Predicted tips of twelve paths, whose errors are correlated within a path.
     assert 0.8 <= gel.held_out.coverage <= 1.0
+
+
+@pytest.mark.parametrize('recordings', [2, 4, 10])
+@pytest.mark.parametrize('factor', [0.3, 3.0])
+def test_predicted_intervals_hold_with_wrong_deviations(recordings: int, factor: float) -> None:
+    """By the errors of the other recordings; the errors along a path are alike."""
+    rng, held = np.random.default_rng(recordings), []
+    growing = np.linspace(0.1, 1.0, 20)[:, np.newaxis] * np.ones(2)
+    for _ in range(1000):
+        errors = factor * rng.standard_normal((recordings, 2))
+        found = [Prediction(one * growing, growing) for one in errors]
+        held.append(np.abs(errors) <= reaches(found)[:, np.newaxis])
+    # Of 2000 directions or more, in groups of one width: 0.7 %, times two.
+    assert np.mean(held) == pytest.approx(0.95, abs=0.014)
 
 
 @pytest.mark.parametrize('seed', [22, 49])
