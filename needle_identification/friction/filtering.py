@@ -175,13 +175,10 @@ def _filtered_velocity(
     from scipy.interpolate import make_interp_spline
 
     start = raw[0] if from_depth else 0.0
-    smooth = _smooth(raw - start, taps)
-    spline = make_interp_spline(time, smooth, k=5 if from_depth else 3)
+    smooth, kept = _smooth(raw - start, taps), time[::step]
     if from_depth:
-        spline = make_interp_spline(time[::step], spline(time[::step], 1), k=3)
-    elif step > 1:
-        spline = make_interp_spline(time[::step], smooth[::step], k=3)
-    return spline
+        return make_interp_spline(kept, make_interp_spline(time, smooth, k=5)(kept, 1), k=3)
+    return make_interp_spline(kept, smooth[::step], k=3)
 
 
 def _white_noise(raw: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> float:
