@@ -23,31 +23,22 @@ settings.register_profile('tests', deadline=None, derandomize=True)
 settings.register_profile('random', deadline=None, derandomize=False)
 settings.load_profile('tests')
 
-#: Files whose tests share expensive fixtures, or need most of a machine: each file runs in one
-#: process. The runs of the reproduction are computed once for all files that use them.
+#: Files whose tests share expensive fixtures, or need most of a machine, and names of their groups:
+#: each group runs in one process. The runs of the reproduction are computed once.
 WHOLE: Final = {
-    **dict.fromkeys(
-        (
-            'test/composition/test_claims.py',
-            'test/composition/test_figures.py',
-            'test/composition/test_mismatch.py',
-            'test/composition/test_reproduce.py',
-        ),
-        'reproduction',
-    ),
-    **{
-        file: file
-        for file in (
-            'test/bench/test_graph.py',
-            'test/bench/test_calibration.py',
-            'test/composition/test_experiment.py',
-            'test/composition/test_plan_page.py',
-            'test/nodes/test_package.py',
-            'test/nodes/test_strangers.py',
-            'test/test_layouts.py',
-        )
-    },
+    'test/bench/test_calibration.py': 'calibration',
+    'test/bench/test_graph.py': 'graph',
+    'test/composition/test_claims.py': 'reproduction',
+    'test/composition/test_experiment.py': 'experiment',
+    'test/composition/test_figures.py': 'reproduction',
+    'test/composition/test_mismatch.py': 'reproduction',
+    'test/composition/test_plan_page.py': 'plan_page',
+    'test/composition/test_reproduce.py': 'reproduction',
+    'test/nodes/test_package.py': 'package',
+    'test/nodes/test_strangers.py': 'strangers',
+    'test/test_layouts.py': 'layouts',
 }
+
 
 #: Multiple of the time limit after which the process of a hanging test is killed.
 LAST: Final = 1.5

@@ -336,13 +336,17 @@ def test_batch_noise_is_encoder_noise() -> None:
         run_batch(law, NOMINAL, START, REFERENCE, late=-1, **options)
 
 
-@pytest.mark.parametrize('modes', [1, 2])
-def test_insertions_together_equal_batches_of_one(modes: int) -> None:
+# Rounding, which the closed loop amplifies; four modes keep five digits, see `LARGEST_CONDITION`.
+@pytest.mark.parametrize(
+    ('modes', 'least', 'digits'), [(1, 0.0, 1e-9), (2, 0.0, 1e-9), (4, 0.06, 1e-5)]
+)
+def test_insertions_together_equal_batches_of_one(modes: int, least: float, digits: float) -> None:
     """Each with its own needle, reference, noise and delay; alone or not, to the bit."""
     law = InverseDynamics(
         axis=Axis.insertion(NOMINAL), gains=InverseDynamicsGains(), period=PERIOD
     )
-    needle, start = replace(NOMINAL, modes=modes), 0.02
+    needle = replace(NOMINAL, modes=modes, minimum_depth=max(least, NOMINAL.minimum_depth))
+    start = least + 0.02
     layers = {'layer_depths': (start + 0.001,), 'layer_stiffnesses': (4e3,), 'swelling': 0.2}
     changes: list[dict[str, Any]] = [layers, {'friction_law': 'stribeck'}, {}]
     models = [NeedleModel(replace(needle, **one)) for one in changes]
@@ -370,9 +374,8 @@ def test_insertions_together_equal_batches_of_one(modes: int) -> None:
         assert np.array_equal(found.goal, batch.goal)
         motion = motion_of(models[i], batch.trajectories[0])
         reached = np.abs(motion).max(axis=1, keepdims=True)
-        # Rounding, which the closed loop amplifies.
-        assert_allclose(found.motion / reached, motion / reached, atol=1e-9)
-        assert_allclose(found.commands, batch.commands[0], atol=1e-7)
+        assert_allclose(found.motion / reached, motion / reached, atol=digits)
+        assert_allclose(found.commands, batch.commands[0], atol=1e2 * digits)
 
 
 def test_insertion_ends_where_its_needle_leaves_its_range() -> None:

@@ -266,7 +266,7 @@ def test_predicted_intervals_hold_with_wrong_deviations(recordings: int, factor:
         errors = factor * rng.standard_normal((recordings, 2))
         found = [Prediction(one * growing, growing) for one in errors]
         held.append(np.abs(errors) <= reaches(found)[:, np.newaxis])
-    # Of 2000 directions or more, in groups of one width: 0.7 %, times two.
+    # Of 1000 independent draws: 0.7 % or less, times two.
     assert np.mean(held) == pytest.approx(0.95, abs=0.014)
 
 
