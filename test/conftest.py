@@ -23,8 +23,8 @@ settings.register_profile('tests', deadline=None, derandomize=True)
 settings.register_profile('random', deadline=None, derandomize=False)
 settings.load_profile('tests')
 
-#: Files whose tests share expensive fixtures, or need most of a machine, and names of their groups:
-#: each group runs in one process. The runs of the reproduction are computed once.
+#: Files whose tests share expensive fixtures, or need most of a machine, and their groups: each
+#: group runs in one process. The runs of the reproduction are computed once.
 WHOLE: Final = {
     'test/bench/test_calibration.py': 'calibration',
     'test/bench/test_graph.py': 'graph',
