@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from math import cos, inf, sin, sqrt, tau
+from math import cos, erf, inf, pi, sin, sqrt, tau
 from typing import Final, NamedTuple, TYPE_CHECKING
 
 from needle_controller.compiled.hypotheses import (
@@ -42,6 +42,8 @@ _COARSE: Final = np.linspace(-1.0, 1.0, 13)
 _TURN: Final = 1e-4**2  #: Least decrease of the mean square distance by a turn [m^2].
 _OVERLOAD: Final = 1.0  #: Cost of a load above its limit [m^2/N^2]: dominates every distance.
 
+_LEAST_VARIANCE: Final = 1e-9**2  #: Least variance of a tip in the plan [m^2].
+
 #: Abscissas and weights of the quadrature over a normal distribution.
 _ABSCISSAS: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
 _WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
@@ -65,7 +67,7 @@ class FinalTip(NamedTuple):
 
     means: ComplexVector  #: mean, x + i z [m], shape (h,)
     errors: Vector  #: standard deviation along each axis [m], shape (h,)
-    turned: Vector  #: range of the tip along each axis by later turns [m], shape (h,)
+    turned: Vector  #: radius of the circle in which later turns move the tip [m], shape (h,)
 
 
 @compiled
@@ -80,10 +82,11 @@ def _ends(c: Steering, w: FloatArray, turns: int, first: int) -> FinalTip:
             g, load = i % len(r.bevel), constant_mean(c, i, BEVEL)
             for j in range(first, last + 1):
                 means[i] -= load * r.bevel[g, last, j] * c.turned[g, j]
-            turned[i] = USED * sqrt(0.5) * abs(load) * r.later_bevel[g, first]
+            turned[i] = abs(load) * r.later_bevel[g, first]
     errors = np.empty(len(means))
     for i in range(len(means)):
-        errors[i] = sqrt(tip.variances[i])
+        # Rounding may exceed a variance near 0.
+        errors[i] = sqrt(max(tip.variances[i], _LEAST_VARIANCE))
     return FinalTip(means, errors, turned)
 
 
@@ -115,7 +118,9 @@ def _reachable(c: Steering, w: FloatArray) -> tuple[ComplexArray, ComplexArray, 
     middles, sizes = ends.means, np.empty(len(ends.means), np.complex128)
     for i in range(len(sizes)):
         middles[i] += shifts[i % points]
-        sizes[i] = reach[i % points] + complex(ends.turned[i], ends.turned[i])
+        # The square with the area of the circle.
+        turned = 0.5 * sqrt(pi) * ends.turned[i]
+        sizes[i] = reach[i % points] + complex(turned, turned)
     return middles, sizes, ends.errors
 
 
@@ -123,6 +128,13 @@ def _reachable(c: Steering, w: FloatArray) -> tuple[ComplexArray, ComplexArray, 
 def reachable_set(boxed: Boxed[Steering]) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """Return middle, half widths, x + i z, and error of the reachable set [m], shape (h,)."""
     return _reachable(boxed.value, weights(boxed.value.logs))
+
+
+@inlined
+def _within(mean: float, deviation: float, size: float) -> float:
+    """Return the probability that a normal variable is between -``size`` and ``size``."""
+    scale = sqrt(0.5) / deviation
+    return 0.5 * (erf(scale * (size - mean)) + erf(scale * (size + mean)))
 
 
 @kernel
@@ -133,16 +145,10 @@ def hit_probability(boxed: Boxed[Steering]) -> float:
     for i in range(len(w)):
         if w[i] == 0.0:
             continue
-        x, z = c.target[0] - middles[i].real, c.target[1] - middles[i].imag
-        along_x = along_z = 0.0
-        for a in range(len(_WEIGHTS)):
-            off = errors[i] * _ABSCISSAS[a]
-            if abs(x + off) <= HIT + sizes[i].real:
-                along_x += _WEIGHTS[a]
-            if abs(z + off) <= HIT + sizes[i].imag:
-                along_z += _WEIGHTS[a]
+        x = _within(c.target[0] - middles[i].real, errors[i], HIT + sizes[i].real)
+        z = _within(c.target[1] - middles[i].imag, errors[i], HIT + sizes[i].imag)
         # The planes are independent in a hypothesis only.
-        found += w[i] * along_x * along_z
+        found += w[i] * x * z
     return found
 
 
@@ -257,7 +263,7 @@ def _costs(c: Steering, w: FloatArray, ends: FinalTip, candidates: FloatArray) -
             shift, anywhere = r.guide[g, last, k], c.limit * r.later_guide[g, k + 1 + near]
             for t in range(count):
                 left[t] = need - shift * to[t]
-                later[t] = USED * anywhere + ends.turned[i]
+                later[t] = USED * (anywhere + sqrt(0.5) * ends.turned[i])
             for j in range(near):
                 shift = r.guide[g, last, k + 1 + j]
                 for t in range(count):

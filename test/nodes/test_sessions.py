@@ -147,7 +147,7 @@ def session(
     """Start a session whose commands come from a pipe."""
     line = [sys.executable, '-m', 'needle_insertion.cli', 'run', '-o', str(folder), *words]
     # A loaded machine is late.
-    line += ['-p', 'controller.measurement_timeout=1']
+    line += ['-p', 'controller.measurement_timeout=5']
     nodes = ['controller'] if mode == '--hardware' else ['controller', 'plant']
     line += [word for node in nodes for word in ('-p', f'{node}.rate={RATE}')]
     line.append(mode)
@@ -168,6 +168,8 @@ def session(
         process.wait()
         assert process.stdin is not None
         process.stdin.close()
+        # pytest shows it if the test fails.
+        sys.stdout.write(output.read_text())
 
 
 def insert(watcher: Watcher, running: Session, *target: str) -> None:
@@ -427,7 +429,7 @@ def test_killed_steering_stops_the_needle_within_its_step(
     options = [
         'steering.step_length=0.03',
         'steering.speed=0.01',
-        'steering.measurement_timeout=5',
+        'steering.measurement_timeout=30',
     ]
     words = [word for one in options for word in ('-p', one)]
     with session(ros_graph, tmp_path / 'run', '--needle', 'bending_35mm', *words) as running:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import inf, sqrt, tau
+from math import inf, pi, sqrt, tau
 from typing import Any
 
 from needle_controller import (
@@ -21,6 +21,7 @@ from needle_dynamics.arrays import ComplexArray
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from scipy.stats import norm
 
 NEEDLE, _STEERING, _ = NEEDLES['bending_35mm']
 STEERING = replace(_STEERING, skin_stiffness=0.02 * NEEDLE.tissue_stiffness)
@@ -143,12 +144,12 @@ class Plain:
         self.errors += 1.0 - w @ sound[:, 0, 0] / w.sum()
 
     def ends(self, turns: int, first: int) -> tuple[ComplexArray, FloatArray, FloatArray]:
-        """Return means, standard deviations, and the range of later turns."""
+        """Return means, standard deviations, and the radius of later turns."""
         means, variances, _ = self.tip(-1, self.guide)
         later, turned = self.r.bevel[:, -1, first:], np.zeros(len(means))
         if turns:
             means = means - self.mean[:, 3] * (later * self.turned[:, first:]).sum(axis=1)
-            turned = 0.8 * sqrt(0.5) * abs(self.mean[:, 3]) * abs(later).sum(axis=1)
+            turned = abs(self.mean[:, 3]) * abs(later).sum(axis=1)
         return means, np.sqrt(variances), turned
 
     def room(self, begin: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
@@ -167,11 +168,10 @@ class Plain:
             ((self.goal - means).real, there.real), ((self.goal - means).imag, there.imag),
         ):  # fmt: skip
             middle, half = (one[0] for one in self.room(np.array([at]), shifts.shape[1]))
-            size = 1e-3 + turned + abs(shifts) @ half
-            off = [
-                abs(need - shifts @ middle + a * errors) <= size for a in (-sqrt(3), 0, sqrt(3))
-            ]
-            chance = chance * (np.transpose(off) @ [1 / 6, 4 / 6, 1 / 6])
+            # The square with the area of the circle of later turns.
+            size = 1e-3 + sqrt(pi) / 2.0 * turned + abs(shifts) @ half
+            end = norm(need - shifts @ middle, errors)
+            chance = chance * (end.cdf(size) - end.cdf(-size))
         return float(chance.sum())
 
     def tried(self, count: int) -> FloatArray:
@@ -195,7 +195,7 @@ class Plain:
             to = tried[plane]
             middle, half = self.room(to, after.shape[1])
             left = at[:, None] - now[:, None] * to - after @ middle.T
-            later = 0.8 * (abs(after) @ half.T) + turned[:, None]
+            later = 0.8 * (abs(after) @ half.T + sqrt(0.5) * turned[:, None])
             for a, weight in ((-sqrt(3), 1 / 6), (0.0, 4 / 6), (sqrt(3), 1 / 6)):
                 short = np.maximum(0.0, abs(left + a * errors[:, None]) - later)
                 found[plane] += weight * (w @ short**2)
