@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, isnan, nan
@@ -17,10 +18,10 @@ from needle_controller.laws.sampled import (
     Pid,
     PidGains,
 )
-from needle_controller.reference.generator import ReferenceGenerator, ReferenceHold
+from needle_controller.reference.generator import LONGEST_BURST, ReferenceGenerator, ReferenceHold
 from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 from needle_controller.safety.input_monitor import DisplacementMonitor
-from needle_controller.stability import check_stability, Limit, MARGIN, Uncertainty
+from needle_controller.stability import check_stability, delay_margin, Limit, MARGIN, Uncertainty
 from needle_dynamics import NeedleParameters
 from needle_ros.contract import INSERTION
 from needle_ros.errors import ParameterError
@@ -226,9 +227,14 @@ class Controller:
             reference, limits or ReferenceLimits(), settings.depths(parameters)
         )
         self.law, self.parameters, self._gains = law, parameters, _completed(gains or {})
-        #: Stability limit of each axis.
+        #: Stability limit of each axis, and age of measurements up to which it is stable [s].
         self.limits: dict[str, Limit]
-        (insertion, rotation), self.limits = self._checked(law, parameters, self._gains)
+        self.age_limits: dict[str, float]
+        (insertion, rotation), self.limits, self.age_limits = self._checked(
+            law, parameters, self._gains
+        )
+        #: Ages of the last measurements; after a gap, all but one may have waited [s].
+        self._ages = deque([0.0] * (LONGEST_BURST + 1), maxlen=LONGEST_BURST + 1)
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
         self._hold = ReferenceHold(self.guide, self.period, self.delay)
@@ -242,27 +248,31 @@ class Controller:
 
     def _checked(
         self, name: str, parameters: NeedleParameters, gains: AllGains
-    ) -> tuple[list[Law], dict[str, Limit]]:
-        """Return the laws and their stability limits; reject unstable gains."""
+    ) -> tuple[list[Law], dict[str, Limit], dict[str, float]]:
+        """Return the laws, and the limits of each axis; reject unstable gains."""
         if name not in LAWS:
             raise ParameterError(f'unknown law {name!r}; valid: {", ".join(LAWS)}')
         require_complete(parameters)
         axes = Axis.insertion(parameters), Axis.rotation(parameters)
         laws: list[Law] = []
         limits: dict[str, Limit] = {}
+        ages: dict[str, float] = {}
         for axis, where in zip(axes, AXES, strict=True):
             chosen = gains[name][where]
             law = LAW_OF[type(chosen)](axis=axis, gains=chosen, period=self.period)
             laws.append(law)
             if where == 'insertion' or self.settings.rotation:
+                plants = self._uncertainty.axes(axis, carriage=where == 'insertion')
                 limits[where] = check_stability(
                     law,
                     self.delay,
                     f'{name}.{where} gains',
                     margin=self.settings.stability_margin,
-                    plants=self._uncertainty.axes(axis, carriage=where == 'insertion'),
+                    plants=plants,
                 )
-        return laws, limits
+                late = self.delay + delay_margin(law, self.delay, plants)
+                ages[where] = late * self.period
+        return laws, limits, ages
 
     def change(
         self,
@@ -279,9 +289,9 @@ class Controller:
         """
         parameters, name = parameters or self.parameters, law or self.law
         completed = _completed(gains or {}, self._gains)
-        (insertion, rotation), limits = self._checked(name, parameters, completed)
+        (insertion, rotation), limits, ages = self._checked(name, parameters, completed)
         self.law, self.parameters, self._gains = name, parameters, completed
-        self.limits = limits
+        self.limits, self.age_limits = limits, ages
         if self.guide.moves:
             self._insertion.switch(insertion)
             self._rotation.switch(rotation)
@@ -375,8 +385,9 @@ class Controller:
         Return the command that answers a measurement of an age [s], with a known load [N].
 
         The force is zero without a target, or on a fault of the measurement: a value is not
-        finite, or the displacement is inconsistent with the velocity. After a gap or a step back
-        in time the motion restarts from the measured depth.
+        finite, the displacement is inconsistent with the velocity, or this and the last four are
+        older than `age_limits`, as for the torque. After a gap or a step back in time the motion
+        restarts from the measured depth.
         """
         notice = None
         gap = self._displacement.gap(measured.time)
@@ -388,14 +399,17 @@ class Controller:
             fault = self._displacement.fault(measured.time, measured.depth, measured.velocity)
         else:
             fault = f'joint_states must be finite, got {measured}'
-        if fault is not None:
-            self.release()
-        else:
+        if fault is None:
             notice = self._returned(measured) or notice
             moves = self.target is not None and not self.guide.paused
             answer = self.check(measured, moves) if self.check is not None else None
             if answer is not None:
                 return answer
+            if self.target is not None:
+                self._ages.append(age)
+                fault = self._too_old('insertion')
+        if fault is not None:
+            self.release()
         if fault is not None or self.target is None:
             return ControllerOutput(
                 force=0.0, setpoint=Setpoint(measured.depth), fault=fault, notice=notice
@@ -403,23 +417,38 @@ class Controller:
         loop, sample = self._insertion, (measured.time, measured.velocity, measured.force)
         base = measured.base or BaseState(measured.depth, measured.velocity)
         if self._hold.measure(sample, age, loop.law.axis.coulomb):
-            if self._hold.missing:
+            if self._hold.missing or self._hold.repeated:
                 loop.unwind()
             else:
                 # The robot holds the last force.
                 loop.stop(loop.last if isnan(measured.force) else measured.force)
         now = self.guide.at(measured.time, base.depth, base.velocity)
         ahead = self.guide.ahead(measured.time + self.delay * self.period)
-        torque = 0.0
-        if self.settings.rotation:
-            angle, rest = measured.angle, Setpoint(0.0)
-            torque = self._rotation.command(angle, measured.angular_velocity, rest)
+        torque = self._torque(measured)
         if self.relaxed:
             loop.unwind()
         force = 0.0 if self.relaxed else loop.command(base.depth, base.velocity, ahead, load)
         limited = base.waits or abs(force) >= loop.limit
         self._hold.command(now, base.depth, force, limited=limited)
         return ControllerOutput(force=force, torque=torque, setpoint=now, notice=notice)
+
+    def _torque(self, measured: Measurement) -> float:
+        if not self.settings.rotation:
+            return 0.0
+        if self._too_old('rotation') is not None:
+            self._rotation.stop()
+            return 0.0
+        return self._rotation.command(measured.angle, measured.angular_velocity, Setpoint(0.0))
+
+    def _too_old(self, axis: str) -> str | None:
+        """Return a line if an axis is unstable at the age of the measurements."""
+        age, limit = min(self._ages), self.age_limits[axis]
+        if age <= limit:
+            return None
+        return (
+            f'measurements are {1e3 * age:.3g} ms old, the {axis} is stable up to '
+            f'{1e3 * limit:.3g} ms: free the machine, or lower rate'
+        )
 
     def _returned(self, measured: Measurement) -> str | None:
         """Clear the target if the needle moved during a fault; return a message then."""

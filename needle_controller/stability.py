@@ -13,6 +13,7 @@ the direction of the measured velocity, or if its integral is too fast. Such law
 simulated on each axis.
 """
 
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -39,6 +40,7 @@ _LEAST: Final = 1e-6  #: Least range of motion that is a limit cycle [m] or [rad
 
 MARGIN: Final = 1e-6  #: Default distance of the spectral radius from one.
 RESERVE: Final = 1  #: Periods of unmodeled delay in reserve.
+_MOST_DELAY: Final = 100  #: Largest unmodeled delay that is examined, in periods.
 
 _MOST_GAIN: Final = 1e6  #: Largest factor on the gains in the search for stable gains.
 _MOST_RATE: Final = 1e3  #: Largest factor on the rate in this search.
@@ -153,6 +155,24 @@ def spectral_radius(law: Law, delay: int, unmodeled: int = 0, plant: Axis | None
     """Return the largest modulus of the poles; below 1 is stable. See `transition_matrix`."""
     matrix = transition_matrix(law, delay, unmodeled, plant)
     return float(np.abs(np.linalg.eigvals(matrix)).max())
+
+
+def delay_margin(law: Law, delay: int, plants: Sequence[Axis] = ()) -> int:
+    """
+    Return how many more periods than ``delay`` the loop may be late; at most 100 are examined.
+
+    With this delay all poles are inside of the unit circle, on the nominal axis and on ``plants``.
+    """
+    margin = _MOST_DELAY
+    # Dry friction does not change the poles.
+    for plant in {(axis.inertia, axis.viscous): axis for axis in (law.axis, *plants)}.values():
+
+        def unstable(late: int, plant: Axis = plant) -> bool:
+            return spectral_radius(law, delay, late, plant) >= 1.0
+
+        if unstable(margin):
+            margin = max(bisect_left(range(margin), True, key=unstable) - 1, 0)
+    return margin
 
 
 def _limits(law: Law, delay: int, margin: float, plants: Sequence[Axis]) -> Iterator[Limit]:

@@ -23,7 +23,8 @@ REFERENCES: dict[str, type[Trapezoid] | type[MinimumJerk] | type[Step]] = {
 _GAP, _PERIODS = 0.01, 2.5
 _ROUNDING: Final = 1.0 + 1e-6  #: Tolerance of an age of exactly one period.
 #: Number of measurements after a gap that may have waited, twice as many as a controller keeps.
-_BURST: Final = 2 * NEWEST.depth
+LONGEST_BURST: Final = 2 * NEWEST.depth
+_AGAIN: Final = 0.2  #: Longest time between two gaps after which no integral is kept [s].
 #: Least response, as a fraction of the commanded force or of the velocity of the reference.
 _NOTHING: Final = 0.1
 #: Relative tolerance of a reported force: equal to a command, and constant; number of reports in a
@@ -192,13 +193,17 @@ class ReferenceHold:
         self._guide, self._gap = guide, max(_GAP, _PERIODS * period) + delay * period
         #: Age of the last two measurements, or time since the previous one if that is longer [s].
         self._late = deque([0.0, 0.0], maxlen=2)
-        #: Least of them before a gap while measurements are late, and their number since then.
+        #: Least of them before a gap while measurements are late, their number since then, and
+        #: time of the last gap [s].
         self._usual: float | None = None
-        self._waited = 0
+        self._waited, self._gap_at = 0, -inf
         #: Last forces [N], the oldest acts; tracking error at the last command [m]; whether the
         #: robot has reported a force, and a commanded force is missing.
         self._forces = deque([0.0], maxlen=delay + 2)
         self._error, self._reports, self.missing = 0.0, False, False
+        #: Whether the last gap followed another one: an integral that each gap keeps, while the
+        #: reference restarts at the needle, is a constant force that no error ends.
+        self.repeated = False
         #: Number of reports of the commanded force in a row; time and force of the last [s, N].
         self._obeyed, self._report = 0, (-inf, 0.0)
 
@@ -211,8 +216,10 @@ class ReferenceHold:
         self._late.append(late)
         begins = late > max(self._gap, _PERIODS * before)
         self._waited = 0 if begins else self._waited + 1
+        self.repeated = begins and time - self._gap_at < _AGAIN
+        self._gap_at = time if begins else self._gap_at
         behind = self._usual is not None and age > _ROUNDING * self._usual
-        gap = begins or (behind and self._waited < _BURST)
+        gap = begins or (behind and self._waited < LONGEST_BURST)
         self.missing = guide.waits
         if guide.waits or not guide.moves:
             self._forces.append(0.0)

@@ -18,8 +18,14 @@ from needle_controller import (
     Setpoint,
     Uncertainty,
 )
+from needle_controller.controller import LAW_OF
 from needle_controller.laws.law import SampledLoop
-from needle_controller.stability import spectral_radius, stability_limit, transition_matrix
+from needle_controller.stability import (
+    delay_margin,
+    spectral_radius,
+    stability_limit,
+    transition_matrix,
+)
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
@@ -357,3 +363,22 @@ def test_accepted_laws_settle_on_all_uncertain_axes(
     assume(stability_limit(law, delay, plants=plants).stable)
     corner, unmodeled = data.draw(st.sampled_from(plants)), data.draw(st.integers(0, 1))
     assert comes_to_rest(law, corner, delay, unmodeled)
+
+
+@pytest.mark.requirement('S-319')
+@pytest.mark.parametrize('gains', [InverseDynamicsGains(), PidGains()])
+@pytest.mark.parametrize('rate', [200.0, 1000.0])
+def test_delay_margin_is_the_largest_stable_delay(
+    gains: InverseDynamicsGains | PidGains, rate: float
+) -> None:
+    """On every axis within the uncertainty, at each shorter delay, and on some not beyond it."""
+    law = LAW_OF[type(gains)](axis=PHANTOM, gains=gains, period=1.0 / rate)
+    axes = [PHANTOM, *Uncertainty().axes(PHANTOM, carriage=True)]
+    margin = delay_margin(law, 1, axes)
+
+    def largest(late: int) -> float:
+        return max(spectral_radius(law, 1, late, axis) for axis in axes)
+
+    assert 1 <= margin < 100
+    assert all(largest(late) < 1.0 for late in range(0, margin + 1, 4))
+    assert largest(margin) < 1.0 <= largest(margin + 1)
