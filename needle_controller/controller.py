@@ -447,7 +447,7 @@ class Controller:
             return None
         return (
             f'measurements are {1e3 * age:.3g} ms old, the {axis} is stable up to '
-            f'{1e3 * limit:.3g} ms: free the machine, or lower rate'
+            f'{1e3 * limit:.3g} ms: free the machine, lower rate, or synchronize the clocks'
         )
 
     def _returned(self, measured: Measurement) -> str | None:

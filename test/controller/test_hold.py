@@ -309,7 +309,7 @@ def test_measurements_that_become_late_do_not_make_the_needle_overshoot(law: str
     assert abs(depths[-1] - TARGET) < AT_REST
 
 
-@pytest.mark.requirement('S-319')
+@pytest.mark.requirement('S-319', 'S-322')
 @pytest.mark.parametrize('law', LAWS)
 @settings(max_examples=3, deadline=None)
 @given(st.floats(0.0, 0.095), st.integers(0, 500))

@@ -365,7 +365,7 @@ def test_accepted_laws_settle_on_all_uncertain_axes(
     assert comes_to_rest(law, corner, delay, unmodeled)
 
 
-@pytest.mark.requirement('S-319')
+@pytest.mark.requirement('S-321')
 @pytest.mark.parametrize('gains', [InverseDynamicsGains(), PidGains()])
 @pytest.mark.parametrize('rate', [200.0, 1000.0])
 def test_delay_margin_is_the_largest_stable_delay(
