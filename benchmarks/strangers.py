@@ -125,8 +125,12 @@ class Bystander:
         self.depths.append(0.2 - message.position[0])
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
-        """Spin until a condition holds."""
-        self._graph.spin_until(condition, what, timeout=180.0)
+        """Spin until a condition holds; a `GraphError` also has depths and status of the nodes."""
+        try:
+            self._graph.spin_until(condition, what, timeout=180.0)
+        except GraphError as error:
+            depths = [f'{1e3 * act(self.depths):.3f}' for act in (min, max)] if self.depths else []
+            raise GraphError(f'{error}; mm {" to ".join(depths)}; {self._complaints}') from error
 
     def goes_to(self, depth: float) -> None:
         """Send a target depth [m] until the needle rests there."""
@@ -188,7 +192,7 @@ class Bystander:
         return any(map(condition, self._statuses))
 
     @property
-    def complaints(self) -> str:
+    def _complaints(self) -> str:
         """Last message of each node."""
         last = {
             node_of(status.name): status.message for one in self._health for status in one.status
@@ -217,7 +221,7 @@ def measure(tick: Tick, tries: int = 10) -> tuple[list[tuple[str, ...]], list[Ba
                 bystander.goes_to(NEXT)
                 afterwards = 'continues' if bystander.stops <= {0} else 'continues after a stop'
             except GraphError as error:
-                afterwards = f'{error}: {bystander.complaints}'
+                afterwards = str(error)
         rows.append((what, str(count), moved, f'{bar:g} mm', afterwards))
         bars.append(Bar(what, found if afterwards == 'continues' else float('inf'), bar, 'mm'))
     return rows, bars
