@@ -396,7 +396,8 @@ class Supervisor(StateMachine[ForceCommand]):
         following, depth = self._following, measured.depth
         step = error[0] if controller.guide.steps else None
         lost = following.update(stamp, depth, aim.velocity, *forces, step, measured.waits)
-        fault = safety.guard.tracking(error[0]) or following.fault
+        receded = controller.guide.receded(depth, aim.velocity)
+        fault = safety.guard.tracking(error[0], receded) or following.fault
         if (stopped := self._stop_for(fault, stamp)) is not None:
             return stopped
         controller.guide.waits, controller.relaxed = lost, following.relaxed

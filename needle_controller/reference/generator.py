@@ -54,6 +54,7 @@ class ReferenceGenerator:
     def forget(self) -> None:
         #: Insertion depth at the end of the motion [m]; None without a target or path.
         self.target: float | None = None
+        self._closest = inf  #: Least distance from the target up to now [m].
         self._path: Path | None = None
         #: Whether it is paused, waits for a plant that does not follow, or holds one setpoint.
         self.paused = self.waits = self.held = False
@@ -89,7 +90,7 @@ class ReferenceGenerator:
         low, high = self._depths
         if not low <= depth <= high:
             raise ParameterError(f'target depth must be in [{low:g}, {high:g}] m, got {depth!r}')
-        self.target, self._path = depth, None
+        self.target, self._path, self._closest = depth, None, inf
         self._replan()
 
     def follow(
@@ -114,7 +115,7 @@ class ReferenceGenerator:
 
     def _halt(self, now: Setpoint) -> Reference:
         motion = self._brake(now)
-        self.target = motion.at(motion.duration).position
+        self.target, self._closest = motion.at(motion.duration).position, inf
         return motion
 
     def pause(self) -> None:
@@ -145,6 +146,16 @@ class ReferenceGenerator:
             change, self._change = self._change, None
             self._motion, self._start = change(now), time
         return self.ahead(time)
+
+    def receded(self, depth: float, velocity: float) -> float:
+        """Return how far a needle moved away from the target [m] while the reference did not."""
+        if self.target is None or self._path is not None:
+            return 0.0
+        to_go = self.target - depth
+        if velocity * to_go < 0.0:
+            self._closest = inf
+        self._closest = min(self._closest, abs(to_go))
+        return abs(to_go) - self._closest
 
     def ahead(self, time: float) -> Setpoint:
         """Return the setpoint at a later time [s] without changes; zero without a motion."""

@@ -24,7 +24,10 @@ _READINGS: Final = {
         ('insertion speed', 'm/s', 'speed'), ('angle', 'rad', 'angle'),
         ('angular speed', 'rad/s', 'angular_speed'),
     ),
-    'reference': (('tracking error', 'm', 'tracking_error'),),
+    'reference': (
+        ('tracking error', 'm', 'tracking_error'),
+        ('motion away from the target', 'm', 'tracking_error'),
+    ),
     'base_wrench': (
         ('axial force', 'N', 'axial_load'), ('lateral force', 'N', 'lateral_load'),
         ('moment', 'N m', 'moment_load'), ('torque about the needle', 'N m', 'torsion_load'),
@@ -128,7 +131,7 @@ class Guard:
         #: Limits of `_READINGS`.
         self._limits = {
             'joint_states': (limits.speed, limits.angle, limits.angular_speed),
-            'reference': (limits.tracking_error,),
+            'reference': (limits.tracking_error, limits.tracking_error),
             'base_wrench': (
                 limits.axial_load, limits.lateral_load, limits.moment_load, limits.torsion_load
             ),
@@ -178,9 +181,9 @@ class Guard:
             'joint_states', measured.velocity, measured.angle, measured.angular_velocity
         )
 
-    def tracking(self, error: float) -> str | None:
-        """Check the distance from the reference [m]."""
-        return self._hold('reference', error)
+    def tracking(self, error: float, receded: float = 0.0) -> str | None:
+        """Check the distance from the reference, and the motion away from the target [m]."""
+        return self._hold('reference', error, receded)
 
     def wrench(self, force: Sequence[float], torque: Sequence[float]) -> str | None:
         """Check force [N] and torque [N m] along x, y (needle) and z; NaN counts as zero."""

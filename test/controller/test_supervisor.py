@@ -239,6 +239,24 @@ def test_all_safety_limits_are_read_by_the_supervisor() -> None:
     assert {one.name for one in fields(SafetyLimits)} <= read
 
 
+@pytest.mark.requirement('S-323')
+@settings(max_examples=10, deadline=None)
+@given(st.floats(2e-3, 9e-3), st.integers(25, 90))
+def test_needle_that_moves_away_from_its_target_is_stopped(speed: float, gap: int) -> None:
+    """Also if a gap before every second measurement restarts the reference at the needle."""
+    loop = Loop(target=0.04, limits=SafetyLimits())
+    loop.depth = 0.035
+    loop.measure()
+    step = speed * PERIOD / SECOND
+    while not loop.supervisor.authority.reason and loop.depth > 0.01:
+        loop.now += (gap - 1) * PERIOD
+        loop.measure(-step * gap, -speed)
+        loop.measure(-step, -speed)
+    assert 'motion away from the target' in loop.supervisor.authority.reason
+    # The second reading beyond the limit stops.
+    assert 0.035 - loop.depth <= SafetyLimits().tracking_error + 2.0 * gap * step + 1e-9
+
+
 def test_fault_of_the_same_kind_gets_one_line() -> None:
     """Also if its line begins with another word."""
     loop = Loop()
