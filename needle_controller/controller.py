@@ -233,8 +233,10 @@ class Controller:
         (insertion, rotation), self.limits, self.age_limits = self._checked(
             law, parameters, self._gains
         )
-        #: Ages of the last measurements; after a gap, all but one may have waited [s].
+        #: Ages of the last measurements, and the least of them [s]; after a gap, all but one may
+        #: have waited.
         self._ages = deque([0.0] * (LONGEST_BURST + 1), maxlen=LONGEST_BURST + 1)
+        self._age = 0.0
         self._insertion = SampledLoop(insertion, self.delay, settings.force_limit)
         self._rotation = SampledLoop(rotation, self.delay, settings.torque_limit)
         self._hold = ReferenceHold(self.guide, self.period, self.delay)
@@ -407,6 +409,7 @@ class Controller:
                 return answer
             if self.target is not None:
                 self._ages.append(age)
+                self._age = min(self._ages)
                 fault = self._too_old('insertion')
         if fault is not None:
             self.release()
@@ -442,11 +445,11 @@ class Controller:
 
     def _too_old(self, axis: str) -> str | None:
         """Return a line if an axis is unstable at the age of the measurements."""
-        age, limit = min(self._ages), self.age_limits[axis]
-        if age <= limit:
+        limit = self.age_limits[axis]
+        if self._age <= limit:
             return None
         return (
-            f'measurements are {1e3 * age:.3g} ms old, the {axis} is stable up to '
+            f'measurements are {1e3 * self._age:.3g} ms old, the {axis} is stable up to '
             f'{1e3 * limit:.3g} ms: free the machine, lower rate, or synchronize the clocks'
         )
 
