@@ -197,7 +197,7 @@ def test_encoder_loss_gives_zero_force_until_recovery(
     loop.moves()
     loop.break_down(kind, 'joint_states', **values)
     loop.rests_without_force(ControllerPhase.FAULT)
-    assert 'joint_states' in loop.status.fault
+    loop.until(lambda: 'joint_states' in loop.status.fault, 'the reason')
     loop.mend()
     loop.arrives(0.04)
 
@@ -301,10 +301,9 @@ def test_controller_resumes_after_a_plant_restart(ros_graph: RosGraph) -> None:
     first = ros_graph.start('plant', {'command_timeout': 1.0})
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
     first.kill()
-    ros_graph.spin_until(
-        lambda: controller.diagnose().status.phase is ControllerPhase.FAULT, 'the fault'
-    )
-    assert 'stale' in controller.diagnose().status.fault
+    # On a busy machine the measurements may be too old before.
+    ros_graph.spin_until(lambda: 'stale' in controller.diagnose().status.fault, 'the fault')
+    assert controller.diagnose().status.phase is ControllerPhase.FAULT
     ros_graph.spin_until(lambda: forces.message.wrench.force.y == 0.0, 'no force')
     ros_graph.start('plant', {'command_timeout': 1.0})
     ros_graph.spin_until(moves, 'motion', timeout=60.0)
