@@ -10,8 +10,9 @@ SOURCES := needle_ros needle_dynamics needle_controller needle_identification ne
 demo: setup
 	$(BIN)/needle demo
 
+# The threads of BLAS would wait for each other: the workers use all cores.
 test: $(VENV)/.dev compiled
-	$(BIN)/python -m pytest -n auto
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check $(SOURCES)

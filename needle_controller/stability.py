@@ -116,45 +116,61 @@ class Limit:
         return self.radius <= self.bound and self.cycle == 0.0
 
 
-def transition_matrix(
-    law: Law, delay: int, unmodeled: int = 0, plant: Axis | None = None
-) -> FloatArray:
+class LinearLoop:
     """
-    Compute the transition matrix of the closed loop over one period, exact for its linear part.
+    Linear part of the loop of a law that models ``delay`` periods from measurement to effect.
 
     The state is position, velocity, the memory of the law (integral, filtered rate and modeled
     motion, if its gains use them) and the pending commands; the latest are known to the law. The
-    law takes ``delay`` periods from measurement to effect into account; ``unmodeled`` more are
-    unknown to it. ``plant`` is the true axis, without its dry friction. The matrix is computed by
-    running the implemented loop on unit states, so that analysis and implementation agree.
+    rows of the law are computed by running the implemented loop on unit states, so that analysis
+    and implementation agree.
     """
-    linear, late = law.linear(), delay + unmodeled
-    moved = (plant or law.axis).without_coulomb()
-    loop, rest = SampledLoop(linear, delay, inf), Setpoint(0.0)
-    # Only memory used by the gains is part of the loop; the offset after a switch decays.
-    c = law.constants
-    follows = c.kp if c.kind == laws.INVERSE_DYNAMICS else 0.0
-    uses = {laws.INTEGRAL: c.ki, laws.RATE: c.filter_time * c.kd}
-    uses |= {laws.POSITION: follows, laws.VELOCITY: follows}
-    used = [entry for entry, gain in uses.items() if gain > 0.0]
-    first = 2 + len(used)
 
-    def period(state: FloatArray) -> list[float]:
-        position, velocity = state[:2].tolist()
-        commands: list[float] = state[first:].tolist()
-        loop.memory[used], loop.memory[laws.FOLLOWS] = state[2:first], float(follows > 0.0)
-        loop.pending.extend(commands[unmodeled:])
-        commands.append(loop.command(position, velocity, rest))
-        end = moved.propagate(position, velocity, commands[0], linear.period)
-        return [*end, *loop.memory[used].tolist(), *commands[1:]]
+    def __init__(self, law: Law, delay: int) -> None:
+        self._law, self._delay = law, delay
+        loop, rest = SampledLoop(law.linear(), delay, inf), Setpoint(0.0)
+        # Only memory used by the gains is part of the loop; the offset after a switch decays.
+        c = law.constants
+        follows = c.kp if c.kind == laws.INVERSE_DYNAMICS else 0.0
+        uses = {laws.INTEGRAL: c.ki, laws.RATE: c.filter_time * c.kd}
+        uses |= {laws.POSITION: follows, laws.VELOCITY: follows}
+        used = [entry for entry, gain in uses.items() if gain > 0.0]
+        #: Number of states before the commands.
+        self._first = first = 2 + len(used)
 
-    return np.array([period(unit) for unit in np.eye(first + late)]).T
+        def answer(state: FloatArray) -> list[float]:
+            loop.memory[used], loop.memory[laws.FOLLOWS] = state[2:first], float(follows > 0.0)
+            loop.pending.extend(state[first:].tolist())
+            position, velocity = state[:2].tolist()
+            force = loop.command(position, velocity, rest)
+            return [*loop.memory[used].tolist(), force]
 
+        #: Memory and command after a period, from the state without unmodeled delay.
+        self._rows = np.array([answer(unit) for unit in np.eye(first + delay)]).T
 
-def spectral_radius(law: Law, delay: int, unmodeled: int = 0, plant: Axis | None = None) -> float:
-    """Return the largest modulus of the poles; below 1 is stable. See `transition_matrix`."""
-    matrix = transition_matrix(law, delay, unmodeled, plant)
-    return float(np.abs(np.linalg.eigvals(matrix)).max())
+    def transition_matrix(self, unmodeled: int = 0, plant: Axis | None = None) -> FloatArray:
+        """
+        Return the transition matrix over one period, exact for the linear part.
+
+        ``unmodeled`` periods of delay are unknown to the law. ``plant`` is the true axis, without
+        its dry friction.
+        """
+        moved, period = (plant or self._law.axis).without_coulomb(), self._law.period
+        late, first = self._delay + unmodeled, self._first
+        known = [*range(first), *range(first + unmodeled, first + late)]
+        # With the new command as last entry, which acts at once without a delay.
+        matrix = np.zeros((first + late, first + late + 1))
+        matrix[:2, [0, 1, first]] = np.transpose(
+            [moved.propagate(p, v, force, period) for p, v, force in np.eye(3).tolist()]
+        )
+        matrix[2:first, known] = self._rows[:-1]
+        matrix[first:, first + 1 :] = np.eye(late)
+        matrix[:, known] += np.outer(matrix[:, -1], self._rows[-1])
+        return matrix[:, :-1]
+
+    def spectral_radius(self, unmodeled: int = 0, plant: Axis | None = None) -> float:
+        """Return the largest modulus of the poles; below 1 is stable."""
+        return float(np.abs(np.linalg.eigvals(self.transition_matrix(unmodeled, plant))).max())
 
 
 def delay_margin(law: Law, delay: int, plants: Sequence[Axis] = ()) -> int:
@@ -163,14 +179,14 @@ def delay_margin(law: Law, delay: int, plants: Sequence[Axis] = ()) -> int:
 
     With this delay all poles are inside of the unit circle, on the nominal axis and on ``plants``.
     """
-    margin = _MOST_DELAY
+    margin, loop = _MOST_DELAY, LinearLoop(law, delay)
     # Dry friction does not change the poles. The axis that needs most time to stop is usually the
     # least stable one: first, it leaves one evaluation for each of the others.
     axes = {(axis.inertia, axis.viscous): axis for axis in (law.axis, *plants)}.values()
     for plant in sorted(axes, key=lambda axis: axis.viscous / axis.inertia):
 
         def unstable(late: int, plant: Axis = plant) -> bool:
-            return spectral_radius(law, delay, late, plant) >= 1.0
+            return loop.spectral_radius(late, plant) >= 1.0
 
         if unstable(margin):
             margin = max(bisect_left(range(margin), True, key=unstable) - 1, 0)
@@ -182,6 +198,7 @@ def _limits(law: Law, delay: int, margin: float, plants: Sequence[Axis]) -> Iter
     inside = float(np.nextafter(1.0, 0.0))
     # Dry friction does not change the poles; limit cycles are searched at the bounds of friction.
     radii: dict[tuple[float, ...], float] = {}
+    loop = LinearLoop(law, delay)
     axes = (law.axis, *plants)
     dry, viscous = (
         {min(values), max(values)}
@@ -192,7 +209,7 @@ def _limits(law: Law, delay: int, margin: float, plants: Sequence[Axis]) -> Iter
             bound = 1.0 - margin if plant is law.axis and unmodeled == 0 else inside
             key = plant.inertia, plant.viscous, unmodeled
             if key not in radii:
-                radii[key] = spectral_radius(law, delay, unmodeled, plant)
+                radii[key] = loop.spectral_radius(unmodeled, plant)
             radius, cycle = radii[key], 0.0
             if radius < 1.0 and plant.coulomb in dry and plant.viscous in viscous:
                 cycle = limit_cycle(law, delay, unmodeled, plant, radius)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Entry points of the nodes: ``ros2 run needle_insertion plant``, or needle-plant."""
 
+import os
 from pathlib import Path
 import runpy
 import signal
@@ -24,10 +25,14 @@ def main() -> None:
     # Imports take a second: Ctrl-C ends them at once, without a traceback.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     name = Path(sys.argv[0]).stem.removeprefix('needle-')
+    # Imported here: setup.py reads this file without the packages.
+    from needle_ros.process import ONE_THREAD
+
+    # Before the import of NumPy; a value of the user stays.
+    os.environ.update({**ONE_THREAD, **os.environ})
     try:
         runpy.run_module(NODES[name], run_name='__main__')
     except ModuleNotFoundError as error:
-        # Imported here: setup.py reads this file without the packages.
         from needle_ros.errors import missing_ros
 
         sys.exit(f'error: {missing_ros(error, f"needle-{name}")}')

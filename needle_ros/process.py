@@ -15,6 +15,10 @@ from needle_ros.errors import ParameterError
 #: Signals that end a node or a command; closing a terminal sends SIGHUP.
 ENDINGS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
+#: Environment of a node: the threads of BLAS wait in a loop, for each other and for a free core,
+#: and take several times as long on a busy machine.
+ONE_THREAD: Final = {'OMP_NUM_THREADS': '1'}
+
 HIGHEST: Final = 99  #: Highest real-time priority of Linux.
 
 

@@ -24,7 +24,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from needle_insertion.nodes import NODES
 from needle_ros.errors import JobError
 from needle_ros.network import claim, domain_of, is_claimed, LOCAL, stay_local
-from needle_ros.process import DeferredSignals
+from needle_ros.process import DeferredSignals, ONE_THREAD
 from needle_ros.run_node import end, END_WITH_PARENT
 from rclpy.client import Client
 from rclpy.context import Context
@@ -79,7 +79,7 @@ class NodeProcess:
             settings += ['-p', f'{key}:={text}']
         self.process = subprocess.Popen(
             [sys.executable, '-m', NODES[name], '--ros-args', *settings],
-            env={**environment, END_WITH_PARENT: str(os.getpid())},
+            env={**ONE_THREAD, **environment, END_WITH_PARENT: str(os.getpid())},
             stdout=log,
             stderr=subprocess.STDOUT,
             pass_fds=inherited,

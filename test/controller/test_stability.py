@@ -20,12 +20,7 @@ from needle_controller import (
 )
 from needle_controller.controller import LAW_OF
 from needle_controller.laws.law import SampledLoop
-from needle_controller.stability import (
-    delay_margin,
-    spectral_radius,
-    stability_limit,
-    transition_matrix,
-)
+from needle_controller.stability import delay_margin, LinearLoop, stability_limit
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
@@ -47,7 +42,7 @@ def test_transition_matrix_equals_the_loop(delay: int, unmodeled: int, filter_ti
     axis = PHANTOM.without_coulomb()
     gains = PidGains(tolerance=0.0, filter_time=filter_time)
     law = Pid(axis=axis, gains=gains, period=PERIOD)
-    matrix = transition_matrix(law, delay, unmodeled)
+    matrix = LinearLoop(law, delay).transition_matrix(unmodeled)
     state = np.zeros(len(matrix))
     state[0] = 1e-3
     loop = SampledLoop(law, delay, np.inf)
@@ -147,7 +142,7 @@ def test_accepted_gains_are_stable_at_every_depth(
     truth = NeedleParameters.preset(preset, coulomb_friction=coulomb)
     law = law_of(gains, Axis.insertion(truth))
     assume(stability_limit(law, delay).stable)
-    radius = spectral_radius(law, delay, unmodeled)
+    radius = LinearLoop(law, delay).spectral_radius(unmodeled)
     # Four decades of the slowest pole, not longer than three seconds.
     periods = 50 + round(log(1e-4) / log(radius))
     assume(periods <= 3000)
@@ -188,7 +183,7 @@ def test_pole_outside_the_unit_circle_diverges(
 ) -> None:
     """In the running loop without friction the error grows by the spectral radius."""
     law = law_of(gains, axis)
-    radius = spectral_radius(law, delay, unmodeled)
+    radius = LinearLoop(law, delay).spectral_radius(unmodeled)
     assume(radius > 1.0 + 1e-3)
     assert not stability_limit(law, delay).stable
     loop, linear = SampledLoop(law.linear(), delay, np.inf), axis.without_coulomb()
@@ -204,7 +199,7 @@ def test_pole_outside_the_unit_circle_diverges(
 def test_gains_of_the_paper_are_stable_in_implicit_form() -> None:
     """On 2 g at 1 kHz kp = 1e3, kv = 1e4 are stable here; the textbook form diverges."""
     law = Pid(axis=PAPER_SI, gains=PidGains(kp=1e3, ki=0.0, kd=1e4), period=PERIOD)
-    assert spectral_radius(law, 0) < 1.0
+    assert LinearLoop(law, 0).spectral_radius() < 1.0
     r = PAPER_SI.response(PERIOD)
     textbook = np.array([[1.0 - 1e3 * r.pf, r.pv - 1e4 * r.pf], [-1e3 * r.vf, r.vv - 1e4 * r.vf]])
     assert np.abs(np.linalg.eigvals(textbook)).max() > 1000.0
@@ -218,14 +213,14 @@ def test_slow_gains_of_the_paper_are_within_the_margin(rate: float) -> None:
     )
     check_stability(law, 1, 'gains')
     # The pole is at -0.05 1/s; the period adds h k_p / (2 k_v) to that.
-    assert_allclose(1.0 - spectral_radius(law, 1), 0.05 / rate, rtol=0.05)
+    assert_allclose(1.0 - LinearLoop(law, 1).spectral_radius(), 0.05 / rate, rtol=0.05)
 
 
 def test_margin_is_enforced() -> None:
     """A margin larger than the margin of the loop is rejected, a smaller one accepted."""
     law = Pid(axis=PHANTOM, gains=PidGains(ki=0.0), period=PERIOD)
     # The slow pole is at -kp / (mu_v + kd) = -15 1/s.
-    assert_allclose(spectral_radius(law, 1), 1.0 - 0.015, atol=5e-4)
+    assert_allclose(LinearLoop(law, 1).spectral_radius(), 1.0 - 0.015, atol=5e-4)
     check_stability(law, 1, 'gains', margin=0.014)
     with pytest.raises(ParameterError, match=r'radius 0\.98.* must be <= 1 - 0\.02') as refusal:
         check_stability(law, 1, 'gains', margin=0.02)
@@ -374,10 +369,10 @@ def test_delay_margin_is_the_largest_stable_delay(
     """On every axis within the uncertainty, at each shorter delay, and on some not beyond it."""
     law = LAW_OF[type(gains)](axis=PHANTOM, gains=gains, period=1.0 / rate)
     axes = [PHANTOM, *Uncertainty().axes(PHANTOM, carriage=True)]
-    margin = delay_margin(law, 1, axes)
+    margin, loop = delay_margin(law, 1, axes), LinearLoop(law, 1)
 
     def largest(late: int) -> float:
-        return max(spectral_radius(law, 1, late, axis) for axis in axes)
+        return max(loop.spectral_radius(late, axis) for axis in axes)
 
     assert 1 <= margin < 100
     assert all(largest(late) < 1.0 for late in range(0, margin + 1, 4))
