@@ -38,6 +38,7 @@ from needle_identification import (
     StiffnessSettings,
 )
 from needle_insertion.report.paper_tables import FORCE_LEVELS
+from needle_ros.process import ONE_THREAD
 from needle_ros.process_pool import processes
 import numpy as np
 from reproduction.population import draw_friction, draw_stiffness
@@ -401,10 +402,7 @@ def studied(
         yield from map(job, range(recordings))
         return
     # The processes use all cores.
-    with (
-        mock.patch.dict(os.environ, OPENBLAS_NUM_THREADS='1', OMP_NUM_THREADS='1'),
-        processes(workers) as pool,
-    ):
+    with mock.patch.dict(os.environ, ONE_THREAD), processes(workers) as pool:
         yield from pool.map(job, range(recordings))
 
 

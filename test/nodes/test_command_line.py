@@ -50,10 +50,10 @@ def test_help_names_every_parameter(ros_graph: RosGraph, name: str) -> None:
 
 @pytest.mark.parametrize(('chosen', 'used'), [({}, '1'), ({'OMP_NUM_THREADS': '2'}, '2')])
 @pytest.mark.parametrize('name', NODES)
-def test_blas_starts_no_threads(
+def test_blas_threads_are_limited_before_the_import_of_numpy(
     ros_graph: RosGraph, name: str, chosen: dict[str, str], used: str
 ) -> None:
-    """BLAS reads the variable at the import of NumPy; a value of the user stays."""
+    """BLAS reads the variable at this import; a value of the user stays."""
     code = (
         f'import os, sys; sys.argv = ["{name}", "--help"]; sys.addaudithook(lambda event, given: '
         'event == "import" and given[0] == "numpy" and '
@@ -67,6 +67,14 @@ def test_blas_starts_no_threads(
         [sys.executable, '-c', code], env=environment, text=True, timeout=60.0
     )
     assert next(line for line in said.splitlines() if line.startswith('at ')) == f'at {used}'
+
+
+def test_blas_threads_of_started_nodes_are_limited(ros_graph: RosGraph) -> None:
+    """Also without the programs of pip and ros2 run, as in `needle run`."""
+    ros_graph.environment.pop('OMP_NUM_THREADS', None)
+    node = ros_graph.start('plant')
+    environment = Path(f'/proc/{node.process.pid}/environ').read_text()
+    assert 'OMP_NUM_THREADS=1' in environment.split('\0')
 
 
 def test_unknown_argument_is_rejected(ros_graph: RosGraph) -> None:
