@@ -95,8 +95,10 @@ def compare_pairs(folder: Path, plan: GraphPlan, tick: Tick) -> dict[str, list[F
             pair.ready('controller')
         rounds.append(_take_turns('loop', pairs, _close_loop, plan, tick))
         for pair in pairs.values():
-            # Two publishers of measurements are rejected.
             pair.kill('plant')
+        for pair in pairs.values():
+            # Measurements of two publishers are refused.
+            pair.wait_for_end('plant')
         rounds.append(_take_turns('round trip', pairs, _answer_probe, plan, tick))
     return {
         name: [

@@ -39,6 +39,9 @@ PAIRS: Final = ('needle', *_BARE, 'needle, steered')
 #: Roles of the bare nodes in place of plant and controller.
 _ROLES: Final = {'plant': 'plant', 'controller': 'echo'}
 
+#: A topic that each publishes.
+_TOPICS: Final = {'plant': 'joint_states', 'controller': 'wrench_command'}
+
 #: Target depths of continuous motion [m].
 TARGETS: Final = (0.06, 0.09)
 
@@ -118,8 +121,12 @@ class Pair:
             self.graph.change(self.node, what, CONFIGURE)
             if what == 'controller':
                 self.graph.change(self.node, what, ACTIVATE)
-        topic = {'plant': 'joint_states', 'controller': 'wrench_command'}[what]
-        self.until(lambda: self.node.count_publishers(topic), topic)
+        self.until(lambda: self.node.count_publishers(_TOPICS[what]), _TOPICS[what])
+
+    def wait_for_end(self, what: str) -> None:
+        """Wait until the publishers of a killed ``plant`` or ``controller`` are gone."""
+        topic = _TOPICS[what]
+        self.until(lambda: not self.node.count_publishers(topic), f'the end of {topic}')
 
     def end(self) -> None:
         """Terminate the bare nodes; the graph terminates the others."""

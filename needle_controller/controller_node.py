@@ -166,7 +166,7 @@ class ControllerNode(ModelNode):
         # The driver of a robot takes ROS messages.
         command, robot = topics.command, self._driver is not None
         self._command = self.publisher(command).publish if robot else self.writer(command)
-        take_state = self._passing(self._supervisor.encoders, self._supervisor.estimate)
+        take_state = self._passing(self._supervisor.encoders, self._supervisor.finish)
         take_wrench = self._passing(self._supervisor.wrench)
         if self._driver is not None:
             self._driver.listen(take_state, take_wrench, self._check_inputs)

@@ -140,7 +140,7 @@ class LinearLoop:
 
         def answer(state: FloatArray) -> list[float]:
             loop.memory[used], loop.memory[laws.FOLLOWS] = state[2:first], float(follows > 0.0)
-            loop.pending.extend(state[first:].tolist())
+            loop.pending[:] = state[first:]
             position, velocity = state[:2].tolist()
             force = loop.command(position, velocity, rest)
             return [*loop.memory[used].tolist(), force]

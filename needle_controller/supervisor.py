@@ -131,6 +131,8 @@ class Supervisor(StateMachine[ForceCommand]):
         self._waiting, self._time = WaitingRequests(self.requests), now
         self.safety.begin(now)
         self._depth, self._origin = None, -1
+        #: Stamp and time of the answered sample that `finish` processes.
+        self._answered: tuple[int, int] | None = None
         self.requests.forget()
         self.bending.forget()
         if self._robot is not None:
@@ -281,7 +283,7 @@ class Supervisor(StateMachine[ForceCommand]):
             answer = self._stop_for(self.safety.guard.tip(deflection, depth, x), now) or answer
             # Every reading beyond a limit is discarded, also a single one.
             if not self.safety.guard.is_beyond('tip_deflection'):
-                self.estimate()
+                self.finish()
                 self.bending.take_tip(reading.stamp, deflection)
         return answer
 
@@ -296,7 +298,7 @@ class Supervisor(StateMachine[ForceCommand]):
             # The sensor also measures the commanded torque of the base.
             moment -= self._last.torque
             if not guard.is_beyond('base_wrench'):
-                self.estimate()
+                self.finish()
                 self.bending.take_wrench(reading.stamp, lateral, moment)
         return answer
 
@@ -325,19 +327,20 @@ class Supervisor(StateMachine[ForceCommand]):
         if (controller := self._active) is None:
             return None
         stamp, answer = reading.stamp, self._check_clock(now)
-        self.estimate()
+        self.finish()
         refusal = self.safety.streams['joint_states'].check(stamp, now)
         if refusal is not None:
             if refusal.kind == REPEATED:
                 return self._again(stamp)
             return answer if refusal.harmless else self._release_for(refusal.line, now)
-        self._timing.add(stamp, now)
+        self._answered = stamp, now
         self._execute_request(stamp)
         try:
             convert = Measurement.from_reading if self._robot is None else self._robot.measurement
             # A float has too few digits for Unix time.
             self._origin = stamp if self._origin < 0 else self._origin
-            measured = convert(reading._replace(stamp=stamp - self._origin))
+            since = Reading(stamp - self._origin, reading.frame, reading.names, reading.values)
+            measured = convert(since)
         except ParameterError as error:
             return self._release_for(str(error), stamp)
         if measured.is_finite():
@@ -354,8 +357,10 @@ class Supervisor(StateMachine[ForceCommand]):
         self._execute_request(stamp + 1)
         return answer
 
-    def estimate(self) -> None:
-        """Estimate the load for the next command; the last command does not wait for it."""
+    def finish(self) -> None:
+        """Do what the last command did not wait for: monitors, and the load for the next one."""
+        if self._answered is not None:
+            self._monitor(*self._answered)
         if not self.bending.waits:
             return
         try:
@@ -363,6 +368,18 @@ class Supervisor(StateMachine[ForceCommand]):
         except NeedleError as error:
             self._warn('observer', f'observer: {error}')
         self._warn('doubt', self.bending.warning)
+
+    def _monitor(self, stamp: int, now: int) -> None:
+        """Monitor latency, saturation and buckling of a command."""
+        self._timing.add(stamp, now)
+        self._answered, last = None, self._last
+        if self.controller is None or not last.reference or self._depth is None:
+            return
+        limits = self.controller.settings
+        full = abs(last.force) >= limits.force_limit or abs(last.torque) >= limits.torque_limit
+        self.safety.saturation.add(stamp, full)
+        parameters = self.controller.parameters
+        self._warn('buckling', buckling_warning(parameters, self._depth, last.force))
 
     def _again(self, stamp: int) -> ForceCommand:
         """Repeat the last command if it answered this stamp, else command zero force."""
@@ -410,11 +427,7 @@ class Supervisor(StateMachine[ForceCommand]):
                 self.fault = ''
                 self.events.add(Severity.INFO, kind='recovery')
         force = 0.0 if following.relaxed else command.force
-        torque, limits = command.torque, controller.settings
-        self._warn('buckling', buckling_warning(controller.parameters, depth, force))
-        full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
-        safety.saturation.add(stamp, full)
-        return self._command(ForceCommand(stamp, force, torque, aim[:2], error))
+        return self._command(ForceCommand(stamp, force, command.torque, aim[:2], error))
 
     def watch(self, now: int, publishers: Mapping[str, int]) -> ForceCommand | None:
         """Check for missing inputs, and for duplicate publishers of commands and measurements."""

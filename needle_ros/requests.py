@@ -236,8 +236,7 @@ class RequestLog:
 
     def due(self) -> bool:
         """Return whether to publish the status now: call after each request and every 0.1 s."""
-        now = self._steady()
-        if not self._changed or now - self._published < _PAUSE:
+        if not self._changed or (now := self._steady()) - self._published < _PAUSE:
             return False
         self._changed, self._published = False, now
         return True

@@ -396,9 +396,8 @@ def axis_step(
 def answer(
     constants: LawTuple,
     memory: Vector,
-    pending: Vector,
+    forces: Vector,
     instant: InstantTuple,
-    acted: float,
     load: float,
     limit: float,
     taken_over: float,
@@ -406,15 +405,17 @@ def answer(
     """
     Return the force within its limit [N] that answers a measurement, and update the memory.
 
-    ``instant`` has the measured state and the setpoint for the effect of the command. ``pending``,
-    shape (delay,), are commands without effect so far [N]; ``acted`` is the force of the last
-    period [N]. Before its limit the force equals a ``taken_over`` one that is not nan [N].
+    ``instant`` has the measured state and the setpoint for the effect of the command. ``forces``,
+    shape (1 + delay,), are the force of the last period and the commands without effect so far
+    [N], updated. Before its limit the force equals a ``taken_over`` one that is not nan [N].
     """
     position, velocity, target, rate, acceleration = instant
-    adapt(constants, memory, position, velocity, acted - load)
-    for force in pending:
-        position, velocity = axis_step(constants, position, velocity, force - load)
+    adapt(constants, memory, position, velocity, forces[0] - load)
+    for i in range(1, len(forces)):
+        position, velocity = axis_step(constants, position, velocity, forces[i] - load)
+        forces[i - 1] = forces[i]
     at = (position, velocity, target, rate, acceleration)
     if not isnan(taken_over):
         _match(constants, memory, at, load, taken_over)
-    return law_step(constants, memory, at, load, limit)
+    forces[-1] = law_step(constants, memory, at, load, limit)
+    return float(forces[-1])

@@ -124,7 +124,10 @@ def run_loop(
     observer.memory[:] = 0.0
     period, m = LawConstants(*law).period, state.shape[0] // 2
     count = setpoints.shape[0]
-    largest, squares, acts, waited = 0.0, 0.0, 0.0, 0
+    largest, squares, waited = 0.0, 0.0, 0
+    # Force of the last period, and pending commands, according to the law.
+    forces = np.zeros(1 + known)
+    forces[1:] = pending[pending.shape[0] - known :]
     for k in range(count + 1):
         depth, velocity = c.length - state[0], -state[m]
         if depths.shape[0] > 0:
@@ -141,14 +144,11 @@ def run_loop(
             depth, velocity = depth + noise[k, 0], velocity + noise[k, 1]
         at = k - waited
         instant = (depth, velocity, setpoints[at, 0], setpoints[at, 1], setpoints[at, 2])
-        late = pending.shape[0] - known
         if observer.memory.shape[0] > 0:
             tip = tip_deflections(c.modes, state.reshape(1, -1))[0] + noise[k, 3]
             load = observed_load(boxed, observer, 0, k * period, period, depth, velocity, tip)
-        command = answer(law, memory, pending[late:], instant, acts, load, limit, np.nan)
+        command = answer(law, memory, forces, instant, load, limit, np.nan)
         waited += _waits(command, limit, setpoints[count - 1, 0] - goal[at])
-        # Force of this period according to the law.
-        acts = pending[late] if known > 0 else command
         force = _delayed(pending, command)
         if commands.shape[0] > 0:
             commands[k] = command

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from math import exp, inf, nan, sqrt
@@ -197,17 +196,16 @@ class SampledLoop:
     def __init__(self, law: Law, delay: int, limit: float) -> None:
         self.law = law
         self.limit = float(limit)
-        #: Commands without effect so far [N].
-        self.pending: deque[float] = deque([0.0] * delay, maxlen=delay)
+        #: Force of the last period, and commands without effect so far [N].
+        self._forces = np.zeros(1 + delay)
+        self.pending = self._forces[1:]
         self.memory = no_memory()
         self.last = 0.0  #: Last command [N].
-        self._acts = 0.0  #: Force of the period that starts now [N].
         self._take_over = False
 
     def stop(self, acts: float = 0.0) -> None:
         """Replace pending commands by a force that acts [N]; discard the modeled motion."""
-        for i in range(len(self.pending)):
-            self.pending[i] = acts
+        self.pending[:] = acts
         self.memory[FOLLOWS] = self.memory[MEASURED] = 0.0
         self.last = 0.0
         self._take_over = False
@@ -256,11 +254,8 @@ class SampledLoop:
         Position and velocity are measured now; the setpoint is for the effect of the command.
         """
         self.last = force = answer(
-            self.law.packed, self.memory, np.array(self.pending, np.float64),
-            _instant(position, velocity, setpoint), self._acts, float(load), self.limit,
-            self.last if self._take_over else nan,
+            self.law.packed, self.memory, self._forces, _instant(position, velocity, setpoint),
+            float(load), self.limit, self.last if self._take_over else nan,
         )  # fmt: skip
         self._take_over = False
-        self._acts = self.pending[0] if self.pending else force
-        self.pending.append(force)
         return force

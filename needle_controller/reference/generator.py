@@ -241,9 +241,12 @@ class ReferenceHold:
         least = _NOTHING * min(map(abs, self._forces))
         self._reports |= abs(reported) >= least > 0.0
         # NaN, a force that is not reported, is not missing.
-        none = abs(reported) < least and least > _NOTHING * friction
-        rests = abs(velocity) <= _NOTHING * abs(guide.ahead(guide.now)[1])
-        if holds or (self._reports and none and rests):
+        if holds or (
+            self._reports
+            and abs(reported) < least
+            and least > _NOTHING * friction
+            and abs(velocity) <= _NOTHING * abs(guide.ahead(guide.now).velocity)
+        ):
             self.missing = guide.held = True
             if abs(self._error) > _GAP * guide.limits.speed:
                 guide.release()

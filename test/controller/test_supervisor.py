@@ -367,7 +367,7 @@ def test_commands_do_not_depend_on_the_origin_of_time(origin: int, law: str) -> 
             rate = 4e-3 if k > 60 else 0.0
             state = Reading(now, '', ('insertion',), ((depth,), (rate,), ()))
             answer = supervisor.encoders(state, now)
-            supervisor.estimate()
+            supervisor.finish()
             assert answer is not None
             found.append((answer.force, answer.torque))
         return found
@@ -478,7 +478,7 @@ def test_stop_resets_the_observer() -> None:
     observer = loop.supervisor.bending.observer
     for word in (STOP, CLEAR_STOP):
         loop.measure()
-        loop.supervisor.estimate()
+        loop.supervisor.finish()
         assert observer.ready
         loop.request(word)
         assert not observer.ready
@@ -495,7 +495,7 @@ def test_wrench_waits_for_encoders_of_its_stamp() -> None:
     loop.wrench(moment=0.25)
     loop.encoders(loop.now, loop.depth, 0.0)
     loop.measure()
-    loop.supervisor.estimate()
+    loop.supervisor.finish()
     assert taken == [None, (0.0, 0.25), None]
 
 
@@ -513,9 +513,9 @@ def test_no_command_waits_for_the_observer() -> None:
             loop.measure(1e-5, 0.01)
             assert later or (observer.ready and observer.tip_deflection) == before
             if not later:
-                loop.supervisor.estimate()
+                loop.supervisor.finish()
                 assert observer.tip_deflection != before
-        loop.supervisor.estimate()
+        loop.supervisor.finish()
         estimates.append(observer.tip_deflection)
     assert estimates[0] == estimates[1]
 
