@@ -13,7 +13,7 @@ from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.input_monitor import InputMonitor, Refusal, REPEATED
 from needle_controller.safety.response_monitor import ResponseMonitor
-from needle_controller.safety.safety import buckling_warning, FaultKind, Safety, SafetyLimits
+from needle_controller.safety.safety import FaultKind, Safety, SafetyLimits
 from needle_controller.safety.timing_monitor import TimingMonitor
 from needle_controller.state_machine import StateMachine
 from needle_dynamics import NeedleModel, NeedleParameters
@@ -131,8 +131,7 @@ class Supervisor(StateMachine[ForceCommand]):
         self._waiting, self._time = WaitingRequests(self.requests), now
         self.safety.begin(now)
         self._depth, self._origin = None, -1
-        #: Stamp and time of the answered sample that `finish` processes.
-        self._answered: tuple[int, int] | None = None
+        self._answered: tuple[int, int] | None = None  #: Stamp and time of a sample for `finish`.
         self.requests.forget()
         self.bending.forget()
         if self._robot is not None:
@@ -339,8 +338,7 @@ class Supervisor(StateMachine[ForceCommand]):
             convert = Measurement.from_reading if self._robot is None else self._robot.measurement
             # A float has too few digits for Unix time.
             self._origin = stamp if self._origin < 0 else self._origin
-            since = Reading(stamp - self._origin, reading.frame, reading.names, reading.values)
-            measured = convert(since)
+            measured = convert(Reading(stamp - self._origin, *reading[1:]))
         except ParameterError as error:
             return self._release_for(str(error), stamp)
         if measured.is_finite():
@@ -360,7 +358,10 @@ class Supervisor(StateMachine[ForceCommand]):
     def finish(self) -> None:
         """Do what the last command did not wait for: monitors, and the load for the next one."""
         if self._answered is not None:
-            self._monitor(*self._answered)
+            self._timing.add(*self._answered)
+            self._answered, (stamp, *forces, reference, _) = None, self._last
+            if reference and self._depth is not None:
+                self._warn('buckling', self.safety.check_force(stamp, self._depth, *forces))
         if not self.bending.waits:
             return
         try:
@@ -368,18 +369,6 @@ class Supervisor(StateMachine[ForceCommand]):
         except NeedleError as error:
             self._warn('observer', f'observer: {error}')
         self._warn('doubt', self.bending.warning)
-
-    def _monitor(self, stamp: int, now: int) -> None:
-        """Monitor latency, saturation and buckling of a command."""
-        self._timing.add(stamp, now)
-        self._answered, last = None, self._last
-        if self.controller is None or not last.reference or self._depth is None:
-            return
-        limits = self.controller.settings
-        full = abs(last.force) >= limits.force_limit or abs(last.torque) >= limits.torque_limit
-        self.safety.saturation.add(stamp, full)
-        parameters = self.controller.parameters
-        self._warn('buckling', buckling_warning(parameters, self._depth, last.force))
 
     def _again(self, stamp: int) -> ForceCommand:
         """Repeat the last command if it answered this stamp, else command zero force."""
@@ -426,8 +415,8 @@ class Supervisor(StateMachine[ForceCommand]):
             if self.fault:
                 self.fault = ''
                 self.events.add(Severity.INFO, kind='recovery')
-        force = 0.0 if following.relaxed else command.force
-        return self._command(ForceCommand(stamp, force, command.torque, aim[:2], error))
+        force, torque = 0.0 if following.relaxed else command.force, command.torque
+        return self._command(ForceCommand(stamp, force, torque, aim[:2], error))
 
     def watch(self, now: int, publishers: Mapping[str, int]) -> ForceCommand | None:
         """Check for missing inputs, and for duplicate publishers of commands and measurements."""

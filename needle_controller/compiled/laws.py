@@ -417,5 +417,6 @@ def answer(
     at = (position, velocity, target, rate, acceleration)
     if not isnan(taken_over):
         _match(constants, memory, at, load, taken_over)
-    forces[-1] = law_step(constants, memory, at, load, limit)
-    return float(forces[-1])
+    force = law_step(constants, memory, at, load, limit)
+    forces[-1] = force
+    return force

@@ -196,7 +196,7 @@ class SampledLoop:
     def __init__(self, law: Law, delay: int, limit: float) -> None:
         self.law = law
         self.limit = float(limit)
-        #: Force of the last period, and commands without effect so far [N].
+        #: Force of the last period, and a view of the commands without effect so far [N].
         self._forces = np.zeros(1 + delay)
         self.pending = self._forces[1:]
         self.memory = no_memory()

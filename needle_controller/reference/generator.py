@@ -259,9 +259,10 @@ class ReferenceHold:
     def _holds(self, time: float, reported: float) -> bool:
         """Return whether a robot reports a force [N] of the past for longer than a gap."""
         (last, held), size = self._report, abs(reported)
-        if min(abs(reported - force) for force in self._forces) <= _EQUAL * size:
-            self._obeyed, self._report = self._obeyed + 1, (time, reported)
-            return False
+        for force in self._forces:
+            if abs(reported - force) <= _EQUAL * size:
+                self._obeyed, self._report = self._obeyed + 1, (time, reported)
+                return False
         if not (abs(reported - held) <= _SAME * size and time - last < _LOST):
             self._obeyed = 0
         return self._obeyed >= _TRUSTED and time - last > self._gap

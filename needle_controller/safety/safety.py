@@ -104,17 +104,6 @@ class SafetyLimits(CheckedSettings):
     )  # fmt: skip
 
 
-def buckling_warning(parameters: NeedleParameters, depth: float, force: float) -> str | None:
-    """Return a warning if a force [N] bends the part outside of the tissue, without a guide."""
-    most = euler_loads(parameters, max(depth, 0.0)).pinned
-    if force <= most:
-        return None
-    return (
-        f"{force:.3g} N exceeds Euler's load {most:.3g} N of the part outside of the tissue: "
-        'without a guide it buckles; lower force_limit'
-    )
-
-
 def _measured(value: float) -> float:
     return 0.0 if isnan(value) else value
 
@@ -247,6 +236,7 @@ class Safety:
         #: Topics with duplicate publishers of commands or measurements.
         self.duplicate_publishers: str | None = None
         self.guard = Guard(limits, settings.depths(parameters))
+        self._settings, self._parameters = settings, parameters
         self.saturation = RateCounter()
         noise = noise or {}
         #: Timeout, valid frames and implausible changes of each input.
@@ -311,6 +301,19 @@ class Safety:
                 self.guard.forget(stream.name)
         required = self.warning(now) if self.limits.sensors_required else None
         return self.guard.violated or required
+
+    def check_force(self, stamp: int, depth: float, force: float, torque: float) -> str | None:
+        """Count a command at its limit; return a warning if its force bends the free part."""
+        limits = self._settings
+        full = abs(force) >= limits.force_limit or abs(torque) >= limits.torque_limit
+        self.saturation.add(stamp, full)
+        most = euler_loads(self._parameters, max(depth, 0.0)).pinned
+        if force <= most:
+            return None
+        return (
+            f"{force:.3g} N exceeds Euler's load {most:.3g} N of the part outside of the tissue: "
+            'without a guide it buckles; lower force_limit'
+        )
 
     def count_publishers(self, publishers: Mapping[str, int]) -> None:
         """Set the number of publishers by topic, including this controller."""
