@@ -410,7 +410,7 @@ class Controller:
             if self.target is not None:
                 self._ages.append(age)
                 self._age = min(self._ages)
-                fault = self._too_old('insertion')
+                fault = self._too_old()
         if fault is not None:
             self.release()
         if fault is not None or self.target is None:
@@ -438,18 +438,18 @@ class Controller:
     def _torque(self, measured: Measurement) -> float:
         if not self.settings.rotation:
             return 0.0
-        if self._too_old('rotation') is not None:
+        if self._age > self.age_limits['rotation']:
             self._rotation.stop()
             return 0.0
         return self._rotation.command(measured.angle, measured.angular_velocity, Setpoint(0.0))
 
-    def _too_old(self, axis: str) -> str | None:
-        """Return a line if an axis is unstable at the age of the measurements."""
-        limit = self.age_limits[axis]
+    def _too_old(self) -> str | None:
+        """Return a line if the insertion is unstable at the age of the measurements."""
+        limit = self.age_limits['insertion']
         if self._age <= limit:
             return None
         return (
-            f'measurements are {1e3 * self._age:.3g} ms old, the {axis} is stable up to '
+            f'measurements are {1e3 * self._age:.3g} ms old, the insertion is stable up to '
             f'{1e3 * limit:.3g} ms: free the machine, lower rate, or synchronize the clocks'
         )
 

@@ -95,19 +95,6 @@ class InputMonitor:
     def _judge(self, stamp: int, now: int, frame: str, values: Sequence[float]) -> Refusal | None:
         if self.publishers > 1:
             return Refusal('disputed', f'{self.publishers} nodes publish {self.name}')
-        refusal = self._judge_stamp(stamp, now)
-        if refusal is not None:
-            return refusal
-        if self._frames and frame not in self._frames:
-            valid = ' or '.join(map(repr, self._frames))
-            return Refusal('frame', f'{self.name} must be in frame {valid}, got {frame!r}')
-        if not values:
-            return None
-        if not all(map(isfinite, values)):
-            return Refusal('not finite', f'{self.name} must be finite, got {list(values)}')
-        return self._judge_change(stamp, values)
-
-    def _judge_stamp(self, stamp: int, now: int) -> Refusal | None:
         age = now - stamp
         if not -self._ahead <= age <= self.timeout:
             if stamp == 0:
@@ -118,7 +105,14 @@ class InputMonitor:
         if stamp < self.last:
             return Refusal(DROPPED, f'{self.name} received out of order')
         self.step, self.last = stamp - self.last, stamp
-        return None
+        if self._frames and frame not in self._frames:
+            valid = ' or '.join(map(repr, self._frames))
+            return Refusal('frame', f'{self.name} must be in frame {valid}, got {frame!r}')
+        if not values:
+            return None
+        if not all(map(isfinite, values)):
+            return Refusal('not finite', f'{self.name} must be finite, got {list(values)}')
+        return self._judge_change(stamp, values)
 
     def _judge_change(self, stamp: int, values: Sequence[float]) -> Refusal | None:
         before, self._values = self._values, values
