@@ -299,7 +299,9 @@ class ControllerNode(ModelNode):
     ) -> Callable[[Reading], None]:
 
         def on_reading(reading: Reading) -> None:
-            self._act(take(reading, self.now()))
+            # Events without a command wait for the next command, or for `_check_inputs`.
+            if (answer := take(reading, self.now())) is not None:
+                self._act(answer)
             then()
 
         return on_reading
