@@ -49,6 +49,7 @@ class Supervisor(StateMachine[ForceCommand]):
         self._timing = TimingMonitor()
         self._robot: Robot | None = None
         self._last = ForceCommand(0)
+        self._answered: tuple[int, int] | None = None  #: Stamp and time of a sample for `finish`.
         #: Last measured insertion depth [m].
         self._depth: float | None = None
         #: The controller while configured, and while measurements are answered.
@@ -130,8 +131,7 @@ class Supervisor(StateMachine[ForceCommand]):
     def _begin(self, now: int) -> None:
         self._waiting, self._time = WaitingRequests(self.requests), now
         self.safety.begin(now)
-        self._depth, self._origin = None, -1
-        self._answered: tuple[int, int] | None = None  #: Stamp and time of a sample for `finish`.
+        self._depth, self._origin, self._answered = None, -1, None
         self.requests.forget()
         self.bending.forget()
         if self._robot is not None:

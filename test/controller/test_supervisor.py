@@ -499,6 +499,18 @@ def test_wrench_waits_for_encoders_of_its_stamp() -> None:
     assert taken == [None, (0.0, 0.25), None]
 
 
+def test_no_measurement_is_answered_before_the_activation() -> None:
+    """Neither by a new supervisor nor by a configured one, with nothing left to finish."""
+    supervisor = Supervisor()
+    for configured in (False, True):
+        if configured:
+            supervisor.configure(Controller(PHANTOM), SafetyLimits())
+        state = Reading(SECOND, '', ('insertion',), ((0.02,), (0.0,), ()))
+        assert supervisor.encoders(state, SECOND) is None
+        supervisor.finish()
+        assert not supervisor.events.take()
+
+
 def test_no_command_waits_for_the_observer() -> None:
     """Each update follows its command; a later update gives the same estimate."""
     estimates = []

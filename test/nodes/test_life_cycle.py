@@ -11,6 +11,7 @@ from typing import Any
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from needle_controller.controller_node import ControllerNode
+from needle_controller.force_command import ForceCommand
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
 from needle_identification.identification_node import IdentificationNode
@@ -18,6 +19,7 @@ from needle_identification.player_node import PlayerNode
 from needle_identification.recorder_node import RecorderNode
 from needle_insertion.slicer.slicer_node import SlicerNode
 from needle_ros.base_node import BaseNode, steady_timer
+from needle_ros.wire import Reading
 import pytest
 from rclpy.lifecycle import TransitionCallbackReturn
 from reproduction.protocol import SHIPPED_BAGS
@@ -129,6 +131,27 @@ def test_only_a_configured_controller_counts_as_commander(ros_graph: RosGraph) -
         count(2)
         assert end() == DONE
         count(1)
+
+
+def test_measurements_before_activation_change_nothing(
+    ros_graph: RosGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A configured controller receives them; active, it answers the next."""
+    ros_graph.add(PlantNode)
+    node = ros_graph.add(ControllerNode, start=False)
+    supervisor = node._supervisor
+    take, answers = supervisor.encoders, list[ForceCommand | None]()
+
+    def encoders(reading: Reading, now: int) -> ForceCommand | None:
+        answers.append(take(reading, now))
+        return answers[-1]
+
+    monkeypatch.setattr(supervisor, 'encoders', encoders)
+    assert node.trigger_configure() == DONE
+    ros_graph.spin_until(lambda: len(answers) > 20, 'measurements')
+    assert set(answers) == {None}
+    assert node.trigger_activate() == DONE
+    ros_graph.spin_until(lambda: answers[-1] is not None, 'an answer')
 
 
 BAG = str(Path(__file__).resolve().parents[2] / 'bags' / 'friction_01')
