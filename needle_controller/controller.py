@@ -21,7 +21,14 @@ from needle_controller.laws.sampled import (
 from needle_controller.reference.generator import LONGEST_BURST, ReferenceGenerator, ReferenceHold
 from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 from needle_controller.safety.input_monitor import DisplacementMonitor
-from needle_controller.stability import check_stability, delay_margin, Limit, MARGIN, Uncertainty
+from needle_controller.stability import (
+    check_stability,
+    delay_margin,
+    HIGHEST_RATE,
+    Limit,
+    MARGIN,
+    Uncertainty,
+)
 from needle_dynamics import NeedleParameters
 from needle_ros.contract import INSERTION
 from needle_ros.errors import ParameterError
@@ -58,7 +65,7 @@ LAWS: Final = tuple(DEFAULT_GAINS)  #: Control laws by name, the default first.
 class ControllerSettings(CheckedSettings):
     """Rate, delay and limits of a controller."""
 
-    rate: float = constant(1000.0, 'Hz', 'rate of joint_states', low=1.0, high=10_000.0)
+    rate: float = constant(1000.0, 'Hz', 'rate of joint_states', low=1.0, high=HIGHEST_RATE)
     delay: float = constant(
         1.0, 'periods', 'number of whole periods from a measurement to the effect of its command',
         high=20.0, whole=True,

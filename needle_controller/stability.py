@@ -42,8 +42,10 @@ MARGIN: Final = 1e-6  #: Default distance of the spectral radius from one.
 RESERVE: Final = 1  #: Periods of unmodeled delay in reserve.
 _MOST_DELAY: Final = 100  #: Largest unmodeled delay that is examined, in periods.
 
-_MOST_GAIN: Final = 1e6  #: Largest factor on the gains in the search for stable gains.
-_MOST_RATE: Final = 1e3  #: Largest factor on the rate in this search.
+HIGHEST_RATE: Final = 10_000.0  #: Highest sample rate of a controller [Hz].
+#: Steps between the factors on gains or rate in the search for stable ones, up to a first and up
+#: to the largest factor.
+_STEPS: Final = ((10.0, 1.1), (1e6, 2.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,22 +157,31 @@ class LinearLoop:
         ``unmodeled`` periods of delay are unknown to the law. ``plant`` is the true axis, without
         its dry friction.
         """
-        moved, period = (plant or self._law.axis).without_coulomb(), self._law.period
+        (matrix,) = self._matrices(unmodeled, [plant or self._law.axis])
+        return np.asarray(matrix)
+
+    def _matrices(self, unmodeled: int, plants: Sequence[Axis]) -> FloatArray:
         late, first = self._delay + unmodeled, self._first
         known = [*range(first), *range(first + unmodeled, first + late)]
         # With the new command as last entry, which acts at once without a delay.
-        matrix = np.zeros((first + late, first + late + 1))
-        matrix[:2, [0, 1, first]] = np.transpose(
-            [moved.propagate(p, v, force, period) for p, v, force in np.eye(3).tolist()]
-        )
-        matrix[2:first, known] = self._rows[:-1]
-        matrix[first:, first + 1 :] = np.eye(late)
-        matrix[:, known] += np.outer(matrix[:, -1], self._rows[-1])
-        return matrix[:, :-1]
+        matrix = np.zeros((len(plants), first + late, first + late + 1))
+        # The two rows of position and velocity: of these, and of the force that acts.
+        matrix[:, 0, 0] = 1.0
+        moved = np.transpose([plant.response(self._law.period) for plant in plants])
+        matrix[:, 0, 1], matrix[:, 1, 1], matrix[:, 0, first], matrix[:, 1, first] = moved
+        matrix[:, 2:first, known] = self._rows[:-1]
+        matrix[:, first:, first + 1 :] = np.eye(late)
+        matrix[:, :, known] += matrix[:, :, -1:] * self._rows[-1]
+        return matrix[:, :, :-1]
 
     def spectral_radius(self, unmodeled: int = 0, plant: Axis | None = None) -> float:
         """Return the largest modulus of the poles; below 1 is stable."""
-        return float(np.abs(np.linalg.eigvals(self.transition_matrix(unmodeled, plant))).max())
+        return float(self.spectral_radii(unmodeled, [plant or self._law.axis])[0])
+
+    def spectral_radii(self, unmodeled: int, plants: Sequence[Axis]) -> FloatArray:
+        """Return `spectral_radius` of each axis, shape (len(plants),)."""
+        poles = np.linalg.eigvals(self._matrices(unmodeled, plants))
+        return np.asarray(np.abs(poles).max(axis=1))
 
 
 def delay_margin(law: Law, delay: int, plants: Sequence[Axis] = ()) -> int:
@@ -179,38 +190,50 @@ def delay_margin(law: Law, delay: int, plants: Sequence[Axis] = ()) -> int:
 
     With this delay all poles are inside of the unit circle, on the nominal axis and on ``plants``.
     """
-    margin, loop = _MOST_DELAY, LinearLoop(law, delay)
-    # Dry friction does not change the poles. The axis that needs most time to stop is usually the
-    # least stable one: first, it leaves one evaluation for each of the others.
-    axes = {(axis.inertia, axis.viscous): axis for axis in (law.axis, *plants)}.values()
-    for plant in sorted(axes, key=lambda axis: axis.viscous / axis.inertia):
+    loop = LinearLoop(law, delay)
+    # The axis that needs most time to stop is usually the least stable one: first, it leaves one
+    # evaluation for the others.
+    axes = sorted(_linear_axes(law, plants), key=lambda axis: axis.viscous / axis.inertia)
+    margin, rest = _MOST_DELAY, axes[:1]
+    while rest and margin > 0:
 
-        def unstable(late: int, plant: Axis = plant) -> bool:
+        def unstable(late: int, plant: Axis = rest[0]) -> bool:
             return loop.spectral_radius(late, plant) >= 1.0
 
-        if unstable(margin):
-            margin = max(bisect_left(range(margin), True, key=unstable) - 1, 0)
+        # Matrices grow with the delay: from short to long ones.
+        late = 1
+        while late < margin and not unstable(late):
+            late = min(2 * late, margin)
+        if unstable(late):
+            longer = range(late // 2, late)
+            margin = max(longer.start + bisect_left(longer, True, key=unstable) - 1, 0)
+        radii = loop.spectral_radii(margin, axes).tolist()
+        rest = [axis for axis, radius in zip(axes, radii, strict=True) if radius >= 1.0]
     return margin
+
+
+def _linear_axes(law: Law, plants: Sequence[Axis]) -> list[Axis]:
+    """Return axes with all different poles; dry friction changes none."""
+    return list({(one.inertia, one.viscous): one for one in (law.axis, *plants)}.values())
 
 
 def _limits(law: Law, delay: int, margin: float, plants: Sequence[Axis]) -> Iterator[Limit]:
     """Yield the stability limits on the nominal axis, and then on the other axes."""
     inside = float(np.nextafter(1.0, 0.0))
-    # Dry friction does not change the poles; limit cycles are searched at the bounds of friction.
-    radii: dict[tuple[float, ...], float] = {}
-    loop = LinearLoop(law, delay)
-    axes = (law.axis, *plants)
+    axes, linear, loop = (law.axis, *plants), _linear_axes(law, plants), LinearLoop(law, delay)
+    radii = [loop.spectral_radii(late, linear).tolist() for late in (0, RESERVE)]
+    both = {(one.inertia, one.viscous): own for one, *own in zip(linear, *radii, strict=True)}
+    # Limit cycles are searched at the bounds of friction.
     dry, viscous = (
         {min(values), max(values)}
         for values in ([axis.coulomb for axis in axes], [axis.viscous for axis in axes])
     )
     for plant in axes:
-        for unmodeled in (0, RESERVE):
-            bound = 1.0 - margin if plant is law.axis and unmodeled == 0 else inside
-            key = plant.inertia, plant.viscous, unmodeled
-            if key not in radii:
-                radii[key] = loop.spectral_radius(unmodeled, plant)
-            radius, cycle = radii[key], 0.0
+        own = both[plant.inertia, plant.viscous]
+        for unmodeled, radius in zip((0, RESERVE), own, strict=True):
+            bound, cycle = inside, 0.0
+            if plant is law.axis and unmodeled == 0:
+                bound = 1.0 - margin
             if radius < 1.0 and plant.coulomb in dry and plant.viscous in viscous:
                 cycle = limit_cycle(law, delay, unmodeled, plant, radius)
             yield Limit(radius=radius, bound=bound, unmodeled=unmodeled, plant=plant, cycle=cycle)
@@ -321,8 +344,10 @@ def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: 
     for factor in _nearby():
         if accepts(law.scaled(factor)):
             return f'all gains times {factor:g} would be stable{known}'
-    for factor in _upwards(_MOST_RATE):
+    for factor in _upwards():
         rate = float(f'{factor / law.period:.3g}')
+        if rate > HIGHEST_RATE:
+            break
         if accepts(replace(law, period=1.0 / rate)):
             return f'a rate of {rate:.7g} Hz would be stable{known}'
     c = law.constants
@@ -332,18 +357,20 @@ def _advice(law: Law, delay: int, margin: float, plants: Sequence[Axis], worst: 
     missing = [name for name, gain in gains.items() if gain == 0.0]
     if missing:
         return f'{" and ".join(missing)} must not be zero'
-    return f'no common factor on the gains and no higher rate would be stable{known}'
+    rates = f'rate up to {HIGHEST_RATE:g} Hz'
+    return f'no common factor on the gains and no {rates} would be stable{known}'
 
 
-def _upwards(most: float) -> Iterator[float]:
-    factor = 1.1
-    while factor <= most:
-        yield factor
-        factor *= 1.1
+def _upwards() -> Iterator[float]:
+    factor = 1.0
+    for most, step in _STEPS:
+        while (factor := step * factor) <= most:
+            yield factor
+        factor /= step
 
 
 def _nearby() -> Iterator[float]:
     """Yield factors of two digits around one, the nearest first."""
-    for factor in _upwards(_MOST_GAIN):
+    for factor in _upwards():
         yield float(f'{1.0 / factor:.2g}')
         yield float(f'{factor:.2g}')
