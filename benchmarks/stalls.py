@@ -30,7 +30,7 @@ from needle_controller import (
     ObserverSettings,
     SafetyLimits,
 )
-from needle_controller.controller import LAWS
+from needle_controller.gains import LAWS
 from needle_controller.steering.motion import smooth
 from needle_dynamics import NeedleParameters
 from needle_dynamics.simulated.run import Event, PARAMETERS

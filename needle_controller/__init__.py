@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from needle_controller.controller import Controller as Controller
     from needle_controller.controller import ControllerOutput as ControllerOutput
     from needle_controller.controller import ControllerSettings as ControllerSettings
-    from needle_controller.controller import DEFAULT_GAINS as DEFAULT_GAINS
-    from needle_controller.controller import LAWS as LAWS
     from needle_controller.controller import Measurement as Measurement
     from needle_controller.force_command import ForceCommand as ForceCommand
+    from needle_controller.gains import DEFAULT_GAINS as DEFAULT_GAINS
+    from needle_controller.gains import LAWS as LAWS
     from needle_controller.hardware import HardwareSettings as HardwareSettings
     from needle_controller.hardware import Robot as Robot
     from needle_controller.in_loop.continuous import run_continuous as run_continuous

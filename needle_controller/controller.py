@@ -4,20 +4,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite, isnan, nan
 from typing import Final, NamedTuple, TypeAlias
 
+from needle_controller.gains import AllGains, AXES, completed, Gains, LAW_OF, LAWS
 from needle_controller.laws.law import Axis, Law, require_complete, SampledLoop
-from needle_controller.laws.sampled import (
-    Adaptive,
-    AdaptiveGains,
-    InverseDynamics,
-    InverseDynamicsGains,
-    Pid,
-    PidGains,
-)
 from needle_controller.reference.generator import LONGEST_BURST, ReferenceGenerator, ReferenceHold
 from needle_controller.reference.setpoint import ReferenceLimits, Setpoint
 from needle_controller.safety.input_monitor import DisplacementMonitor
@@ -38,27 +31,10 @@ from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import joint_values, JointPath
 from needle_ros.wire import Reading
 
-AXES: Final = ('insertion', 'rotation')  #: Controlled axes.
-
-Gains: TypeAlias = InverseDynamicsGains | AdaptiveGains | PidGains
-AllGains: TypeAlias = Mapping[str, Mapping[str, Gains]]  #: Gains by law and axis.
-
-#: Default gains by law and axis. Those of rotation by PID make a closed loop of 20 rad/s on the
-#: rotary inertia of the paper's needle.
-DEFAULT_GAINS: Final[AllGains] = {
-    'adaptive': {'insertion': AdaptiveGains(), 'rotation': AdaptiveGains()},
-    'inverse_dynamics': {'insertion': InverseDynamicsGains(), 'rotation': InverseDynamicsGains()},
-    'pid': {'insertion': PidGains(), 'rotation': PidGains(kp=2.1e-7, ki=0.0, kd=2.1e-8)},
-}
-
-#: Law of each class of gains.
-LAW_OF: Final[Mapping[type[Gains], type[Law]]] = {
-    AdaptiveGains: Adaptive,
-    InverseDynamicsGains: InverseDynamics,
-    PidGains: Pid,
-}
-
-LAWS: Final = tuple(DEFAULT_GAINS)  #: Control laws by name, the default first.
+#: Law, needle and tissue, and all gains of a controller.
+_Wanted: TypeAlias = tuple[str, NeedleParameters, dict[str, dict[str, Gains]]]
+#: Its laws, and its limits of stability and of the age of measurements by axis.
+_Checked: TypeAlias = tuple[list[Law], dict[str, Limit], dict[str, float]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -233,13 +209,15 @@ class Controller:
         self.guide = ReferenceGenerator(
             reference, limits or ReferenceLimits(), settings.depths(parameters)
         )
-        self.law, self.parameters, self._gains = law, parameters, _completed(gains or {})
+        self.law, self.parameters, self._gains = law, parameters, completed(gains or {})
         #: Stability limit of each axis, and age of measurements up to which it is stable [s].
         self.limits: dict[str, Limit]
         self.age_limits: dict[str, float]
         (insertion, rotation), self.limits, self.age_limits = self._checked(
             law, parameters, self._gains
         )
+        #: Law, constants and gains of the last `check_change`, and its result or error.
+        self._examined: tuple[_Wanted, _Checked | ParameterError] | None = None
         #: Ages of the last measurements, and the least of them [s]; after a gap, all but one may
         #: have waited.
         self._ages = deque([0.0] * (LONGEST_BURST + 1), maxlen=LONGEST_BURST + 1)
@@ -255,9 +233,7 @@ class Controller:
         self.check: Callable[[Measurement, bool], ControllerOutput | None] | None = None
         self.forget()
 
-    def _checked(
-        self, name: str, parameters: NeedleParameters, gains: AllGains
-    ) -> tuple[list[Law], dict[str, Limit], dict[str, float]]:
+    def _checked(self, name: str, parameters: NeedleParameters, gains: AllGains) -> _Checked:
         """Return the laws, and the limits of each axis; reject unstable gains."""
         if name not in LAWS:
             raise ParameterError(f'unknown law {name!r}; valid: {", ".join(LAWS)}')
@@ -283,6 +259,27 @@ class Controller:
                 ages[where] = late * self.period
         return laws, limits, ages
 
+    def _wanted(
+        self, parameters: NeedleParameters | None, law: str | None, gains: AllGains | None
+    ) -> _Wanted:
+        return law or self.law, parameters or self.parameters, completed(gains or {}, self._gains)
+
+    def check_change(
+        self,
+        parameters: NeedleParameters | None = None,
+        *,
+        law: str | None = None,
+        gains: AllGains | None = None,
+    ) -> None:
+        """Check the stability before `change`, which then takes no time; in any thread."""
+        self._examined = self._examine(self._wanted(parameters, law, gains))
+
+    def _examine(self, wanted: _Wanted) -> tuple[_Wanted, _Checked | ParameterError]:
+        try:
+            return wanted, self._checked(*wanted)
+        except ParameterError as error:
+            return wanted, error
+
     def change(
         self,
         parameters: NeedleParameters | None = None,
@@ -296,11 +293,14 @@ class Controller:
         Missing gains stay. During a motion the switch is bumpless: the force is continuous. If the
         gains are unstable with the changes, nothing is changed.
         """
-        parameters, name = parameters or self.parameters, law or self.law
-        completed = _completed(gains or {}, self._gains)
-        (insertion, rotation), limits, ages = self._checked(name, parameters, completed)
-        self.law, self.parameters, self._gains = name, parameters, completed
-        self.limits, self.age_limits = limits, ages
+        wanted, examined = self._wanted(parameters, law, gains), self._examined
+        if examined is None or examined[0] != wanted:
+            examined = self._examine(wanted)
+        _, found = examined
+        if isinstance(found, ParameterError):
+            raise found
+        (insertion, rotation), self.limits, self.age_limits = found
+        self.law, self.parameters, self._gains = wanted
         if self.guide.moves:
             self._insertion.switch(insertion)
             self._rotation.switch(rotation)
@@ -471,20 +471,3 @@ class Controller:
         self._discard_motion()
         self._last_depth = measured.depth
         return f'the needle has moved by {moved:.6f} m since the fault; the target is cleared'
-
-
-def _completed(gains: AllGains, defaults: AllGains = DEFAULT_GAINS) -> dict[str, dict[str, Gains]]:
-    """Return gains of every law and axis; reject unknown names and gains of another law."""
-    completed = {law: dict(axes) for law, axes in defaults.items()}
-    for law, axes in gains.items():
-        for axis, chosen in axes.items():
-            if law not in completed or axis not in completed[law]:
-                raise ParameterError(
-                    f'unknown gains {law}.{axis}; valid: {", ".join(LAWS)} with '
-                    f'{" and ".join(AXES)}'
-                )
-            kind = type(completed[law][axis])
-            if not isinstance(chosen, kind):
-                raise ParameterError(f'{law}.{axis} must be {kind.__name__}, got {chosen!r}')
-            completed[law][axis] = chosen
-    return completed

@@ -11,8 +11,9 @@ from typing import Any
 
 from geometry_msgs.msg import PointStamped
 from needle_controller.commissioning import CommissioningSettings
-from needle_controller.controller import Controller, ControllerSettings, DEFAULT_GAINS, Gains, LAWS
+from needle_controller.controller import Controller, ControllerSettings
 from needle_controller.force_command import ForceCommand
+from needle_controller.gains import DEFAULT_GAINS, Gains, LAWS
 from needle_controller.hardware import HardwareSettings
 from needle_controller.hardware_node import await_topics, CONTRACT, Driver
 from needle_controller.observer.settings import ObserverSettings
@@ -21,6 +22,7 @@ from needle_controller.reference.setpoint import ReferenceLimits
 from needle_controller.safety.safety import SafetyLimits
 from needle_controller.stability import Uncertainty
 from needle_controller.supervisor import Supervisor
+from needle_dynamics import NeedleParameters
 from needle_dynamics.model_node import ModelNode
 from needle_ros import contract
 from needle_ros.base_node import NEWEST, steady_timer
@@ -238,13 +240,26 @@ class ControllerNode(ModelNode):
             raise ParameterError(f'{_RETRACT} must be in [{low:g}, {high:g}] m, got {value!r}')
         return float(value)
 
+    def check_before(self, changes: Mapping[str, Any]) -> Callable[[], object] | None:
+        """Check the stability in a thread: unstable gains take up to seconds."""
+        controller = self._supervisor.controller
+        if controller is None:
+            return None
+        parameters, law, gains = self._wanted(changes)
+        return lambda: controller.check_change(parameters, law=law, gains=gains)
+
+    def _wanted(
+        self, changes: Mapping[str, Any]
+    ) -> tuple[NeedleParameters, str, dict[str, dict[str, Gains]]]:
+        law = self.text('law', LAWS, changes)
+        return self.model_parameters(changes), law, self._gains(changes)
+
     def change(self, changes: Mapping[str, Any]) -> None:
         """Continue with other gains, friction or law; reject unstable gains."""
         try:
-            parameters = self.model_parameters(changes)
+            parameters, law, gains = self._wanted(changes)
             depth = self._retract_depth(changes)
-            law = self.text('law', LAWS, changes)
-            self._supervisor.change(parameters, law, self._gains(changes))
+            self._supervisor.change(parameters, law, gains)
         except ParameterError as error:
             self._supervisor.events.reject(f'parameters: {error}')
             self.publish_events(self._supervisor.events)

@@ -6,8 +6,9 @@ from dataclasses import replace
 from time import monotonic
 from typing import Final
 
-from needle_controller.controller import Controller, ControllerSettings, Gains, Measurement
+from needle_controller.controller import Controller, ControllerSettings, Measurement
 from needle_controller.force_command import ForceCommand
+from needle_controller.gains import AllGains
 from needle_controller.hardware import Robot, STAMPS
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
@@ -93,9 +94,7 @@ class Supervisor(StateMachine[ForceCommand]):
         self.controller = self._active = None
         self.bending = LoadEstimator(NeedleParameters())
 
-    def change(
-        self, parameters: NeedleParameters, law: str, gains: Mapping[str, Mapping[str, Gains]]
-    ) -> None:
+    def change(self, parameters: NeedleParameters, law: str, gains: AllGains) -> None:
         """Continue with other constants, gains or law; see `Controller.change`."""
         if self.controller is not None:
             self.controller.change(parameters, law=law, gains=gains)

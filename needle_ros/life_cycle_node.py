@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterable, Iterator
 import gc
 from importlib import import_module
 from threading import Thread
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from needle_ros.services_node import DeferredService
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
 
@@ -100,10 +101,7 @@ class LifeCycle:
         self._node, self._preparation, self._is_valid = node, preparation, is_valid
         self._waiting: Callable[[], object] | None = None  #: Called after the preparation.
         self._later: ChangeState.Response | None = None  #: Deferred response.
-        self._header: Any = None  #: Header of its request.
-        service: Any = node._service_change_state
-        self._send = service.send_response
-        service.callback, service.send_response = self._on_request, self._on_response
+        self._service = DeferredService(node._service_change_state, self._on_request)
 
     def when_prepared(self, act: Callable[[], object]) -> None:
         """Call `act` after the preparation: immediately if complete, else from the executor."""
@@ -127,9 +125,7 @@ class LifeCycle:
         if act is not None:
             act()
 
-    def _on_request(
-        self, request: ChangeState.Request, response: ChangeState.Response
-    ) -> ChangeState.Response:
+    def _on_request(self, request: ChangeState.Request, response: ChangeState.Response) -> bool:
         machine, log = self._node._state_machine, self._node.get_logger()
         valid = {label: number for number, label, *_ in machine.available_transitions}
         asked = request.transition
@@ -146,14 +142,8 @@ class LifeCycle:
         else:
             self._later = response
             self.when_prepared(self._configure)
-        return response
-
-    def _on_response(self, response: ChangeState.Response, header: Any) -> None:
-        """Send a response, unless it is deferred; the executor calls this."""
-        if response is self._later:
-            self._header = header
-        else:
-            self._send(response, header)
+            return self._later is None
+        return True
 
     def _configure(self) -> None:
         response, self._later = self._later, None
@@ -162,7 +152,7 @@ class LifeCycle:
         # The node may have been shut down meanwhile.
         if self._node._state_machine.current_state[1] == 'unconfigured':
             response.success = self._trigger(_CONFIGURE)
-        self._send(response, self._header)
+        self._service.send(response)
 
     def _trigger(self, transition: int) -> bool:
         done = _TRIGGERS[transition](self._node)

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.quantities import quantity
+from needle_ros.services_node import ParameterServices
 from needle_ros.settings import check_choice, constraints, from_values, unknown_name
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
 from rclpy.lifecycle import LifecycleNode
@@ -24,7 +25,8 @@ _MARK = 'ros__parameters'  #: Key of the parameters in a section of a file.
 _READ_AS_BOOL = ('y', 'n')  #: Strings that rcl parses as booleans in a parameter file.
 
 
-class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
+# With libyaml, if PyYAML has it: a running node writes its parameters after each change.
+class _Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
     """Quotes strings that rcl would parse as booleans and PyYAML would not."""
 
 
@@ -56,9 +58,24 @@ class ParameterNode(LifecycleNode):
         self.shared: frozenset[str] = frozenset()
         self._configured = False
         self.add_on_set_parameters_callback(self._check_change)
+        self._parameter_services = ParameterServices(self)
 
     def change(self, changes: Mapping[str, Any]) -> None:
         """Apply new values of `LIVE` parameters by name; raise `NeedleError` to reject them."""
+
+    def check_before(self, _changes: Mapping[str, Any]) -> Callable[[], object] | None:
+        """Return the part of `change` that takes long, for a thread; it keeps its result."""
+        return None
+
+    def long_check(self, parameters: list[Parameter]) -> Callable[[], object] | None:
+        """Return `check_before` of parameters that may change, otherwise None."""
+        changes = self._changes(parameters) if self._configured else {}
+        if not changes or set(changes) - self.LIVE:
+            return None
+        # `change` raises the error of an invalid value.
+        with suppress(NeedleError):
+            return self.check_before(changes)
+        return None
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set declared parameters; the error of rclpy for an undeclared one does not name it."""
@@ -179,13 +196,16 @@ class ParameterNode(LifecycleNode):
                 f'{count - len(unknown)} of {count} given parameters are known: {reasons}'
             )
 
+    def _changes(self, parameters: list[Parameter]) -> dict[str, Any]:
+        """Return the new values; others are accepted: a whole file can be loaded again."""
+        now = self.values()
+        given = {one.name: self._meant(one.name, one.value) for one in parameters}
+        return {name: new for name, new in given.items() if not _same(new, now.get(name))}
+
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
         if not self._configured:
             return SetParametersResult(successful=True)
-        # Unchanged values are accepted, so that a whole parameter file can be loaded again.
-        now = self.values()
-        given = {one.name: self._meant(one.name, one.value) for one in parameters}
-        changes = {name: new for name, new in given.items() if not _same(new, now.get(name))}
+        changes = self._changes(parameters)
         fixed = ', '.join(name for name in changes if name not in self.LIVE)
         if fixed:
             reason = f'{fixed}: cannot change while configured; clean up the node first'

@@ -7,7 +7,7 @@ from math import copysign, nan
 from typing import Any, Final, NamedTuple
 
 import needle_controller as control
-from needle_controller.controller import LAW_OF
+from needle_controller.gains import LAW_OF
 from needle_controller.in_loop.observed import TipObserver
 from needle_controller.in_loop.sampled import motion_of, run_insertions
 from needle_controller.laws.law import Law, require_complete

@@ -254,6 +254,36 @@ def test_switch_to_unstable_gains_is_rejected() -> None:
     assert steering.law == 'inverse_dynamics'
 
 
+@pytest.mark.parametrize('kv', [61.0, 3000.0])
+@pytest.mark.parametrize('same', [True, False])
+def test_checked_change_equals_an_unchecked_one(kv: float, same: bool) -> None:
+    """A check before changes nothing: limits or error are equal, also after another check."""
+    each = controller(), controller()
+    errors = []
+    for steering, checked in zip(each, (True, False), strict=True):
+        wanted = {'inverse_dynamics': {'insertion': InverseDynamicsGains(kv=kv)}}
+        if checked:
+            steering.check_change(gains=wanted if same else None)
+        try:
+            steering.change(gains=wanted)
+        except ParameterError as error:
+            errors.append(str(error))
+    assert len(errors) == (2 if kv > 1e3 else 0)
+    assert len(set(errors)) < 2
+    before, after = each
+    assert (before.limits, before.age_limits) == (after.limits, after.age_limits)
+
+
+def test_checked_change_is_not_checked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The change takes no time, so that no measurement waits for it."""
+    steering = controller()
+    wanted = {'inverse_dynamics': {'insertion': InverseDynamicsGains(kv=61.0)}}
+    steering.check_change(gains=wanted)
+    monkeypatch.setattr(Controller, '_checked', lambda *_: pytest.fail('checked again'))
+    steering.change(gains=wanted)
+    assert steering._insertion.law.gains == wanted['inverse_dynamics']['insertion']
+
+
 def test_stability_limits_are_reported() -> None:
     """A radius for each axis; a margin above the margin of the gains is rejected."""
     steering = controller()

@@ -12,7 +12,7 @@ from benchmarks.stalls import fastest, insert, LIMIT, Stall, StalledLoop, START,
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from needle_controller import Controller, Measurement, ReferenceLimits, Setpoint
-from needle_controller.controller import LAWS
+from needle_controller.gains import LAWS
 from needle_dynamics import NeedleParameters
 from needle_dynamics.simulated.assembly import PlantSettings
 from needle_ros.contract import NEWEST

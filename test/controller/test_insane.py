@@ -9,7 +9,7 @@ from benchmarks.loop import Loop, LoopFault, Sent
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from needle_controller import Observer, ObserverSettings
-from needle_controller.controller import LAWS
+from needle_controller.gains import LAWS
 from needle_dynamics import NeedleParameters, ParameterError
 from needle_ros.system_state import CLEAR_STOP
 import pytest

@@ -20,7 +20,7 @@ from needle_controller import (
     Setpoint,
 )
 from needle_controller.compiled.loop import run_loop
-from needle_controller.controller import LAW_OF
+from needle_controller.gains import LAW_OF
 from needle_controller.in_loop.observed import compiled_observer, TipObserver
 from needle_controller.in_loop.sampled import LoopInsertion, motion_of, run_insertions
 from needle_controller.laws.law import Law, SampledLoop

@@ -5,6 +5,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from math import log
 import re
+from typing import Any
 
 from hypothesis import assume, given, HealthCheck, settings
 from hypothesis import strategies as st
@@ -16,11 +17,13 @@ from needle_controller import (
     Pid,
     PidGains,
     Setpoint,
+    stability,
     Uncertainty,
 )
-from needle_controller.controller import LAW_OF
+from needle_controller.compiled import laws, loop
+from needle_controller.gains import LAW_OF
 from needle_controller.laws.law import SampledLoop
-from needle_controller.stability import delay_margin, LinearLoop, stability_limit
+from needle_controller.stability import delay_margin, HIGHEST_RATE, LinearLoop, stability_limit
 from needle_dynamics import Integrator, NeedleModel, NeedleParameters, ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
@@ -244,6 +247,22 @@ def test_unstable_gains_are_rejected_with_advice() -> None:
     check_stability(law.scaled(factor), 1, 'my gains')
     # Gains larger by 10 % are unstable.
     assert not stability_limit(law.scaled(1.15 * factor), 1).stable
+
+
+def test_search_for_stable_gains_ends_at_the_highest_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only valid rates are simulated; up to 1 MHz, this search took three minutes."""
+    rates, ring = [], loop.ring
+
+    def recorded(law: tuple[float, ...], *others: Any) -> tuple[float, float, int]:
+        rates.append(1.0 / laws.LawConstants(*law).period)
+        return ring(law, *others)
+
+    monkeypatch.setattr(stability, 'ring', recorded)
+    law = law_of(PidGains(kp=100.0, ki=1e5, kd=1e4), PHANTOM)
+    plants = Uncertainty().axes(PHANTOM, carriage=True)
+    with pytest.raises(ParameterError, match=r'no common factor .* and no rate up to 10000 Hz'):
+        check_stability(law, 1, 'gains', plants=plants)
+    assert 1e3 < max(rates) <= HIGHEST_RATE
 
 
 @pytest.mark.parametrize(

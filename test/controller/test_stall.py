@@ -7,7 +7,8 @@ from collections.abc import Iterable
 from math import nan
 
 from benchmarks.loop import Loop, LoopFault, Sent
-from needle_controller.controller import ControllerSettings, DEFAULT_GAINS, LAWS
+from needle_controller.controller import ControllerSettings
+from needle_controller.gains import DEFAULT_GAINS, LAWS
 from needle_controller.laws.sampled import InverseDynamicsGains
 from needle_controller.safety.response_monitor import ResponseMonitor
 from needle_controller.stability import Uncertainty

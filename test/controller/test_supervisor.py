@@ -11,7 +11,7 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from needle_controller import Controller, ForceCommand, Measurement, ObserverSettings, SafetyLimits
-from needle_controller.controller import LAWS
+from needle_controller.gains import LAWS
 from needle_controller.supervisor import Supervisor
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity

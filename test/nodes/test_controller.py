@@ -4,12 +4,16 @@
 from collections.abc import Callable
 from itertools import pairwise
 from math import inf, nan
+from threading import Event
 from time import monotonic
 from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PointStamped, WrenchStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from needle_controller.compiled.laws import INTEGRAL
+from needle_controller.controller import Controller
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, SENSOR
@@ -17,6 +21,7 @@ from needle_ros.event_log import Severity
 from needle_ros.status import ControllerPhase, ControllerStatus, InputStatus
 from needle_ros.system_state import Mode
 import pytest
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.duration import Duration
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -515,6 +520,79 @@ def test_invalid_gains_are_rejected_while_active(
     assert reason in answer.reason
     assert node.get_parameter(name).value == before
     assert reason in node.diagnose().status.last_rejection
+
+
+@pytest.mark.requirement('S-324')
+def test_controller_works_during_a_check_of_gains(
+    ros_graph: RosGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Measurements and ~/stop are answered; the changes are made in the order of the requests."""
+    bench = Bench(ros_graph)
+    client = bench.node.create_client(SetParameters, 'controller/set_parameters')
+    ros_graph.spin_until(client.service_is_ready, 'the service')
+    bench.aim(0.1)
+    assert bench.push() > 0.5
+    checked, go_on = Controller._checked, Event()
+
+    def check(self: Controller, *wanted: Any) -> Any:
+        assert go_on.wait(60.0)
+        return checked(self, *wanted)
+
+    monkeypatch.setattr(Controller, '_checked', check)
+
+    def change(**gains: float) -> Future:
+        changes = [
+            Parameter(f'adaptive.insertion.{name}', value=value).to_parameter_msg()
+            for name, value in gains.items()
+        ]
+        return client.call_async(SetParameters.Request(parameters=changes))
+
+    answers = [change(kv=3000.0), change(kp=901.0, kv=61.0), change(kp=902.0)]
+    assert min(bench.measure(0.02) for _ in range(5)) > 0.5
+    assert bench.call('stop').success
+    assert bench.measure(0.02) == 0.0
+    assert not any(answer.done() for answer in answers)
+    go_on.set()
+    ros_graph.spin_until(lambda: all(answer.done() for answer in answers), 'the changes')
+    successes = [[one.successful for one in answer.result().results] for answer in answers]
+    assert successes == [[False], [True, True], [True]]
+    assert 'are unstable' in bench.status.last_rejection
+    values = bench.controller.values()
+    assert [values[f'adaptive.insertion.{name}'] for name in ('kp', 'kv')] == [902.0, 61.0]
+
+
+def test_deactivation_during_a_check_of_gains(
+    ros_graph: RosGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The value is set, and used by the next configuration."""
+    bench = Bench(ros_graph)
+    client = bench.node.create_client(
+        SetParametersAtomically, 'controller/set_parameters_atomically'
+    )
+    ros_graph.spin_until(client.service_is_ready, 'the service')
+    checked, begun, go_on = Controller._checked, Event(), Event()
+
+    def check(self: Controller, *wanted: Any) -> Any:
+        begun.set()
+        assert go_on.wait(60.0)
+        return checked(self, *wanted)
+
+    monkeypatch.setattr(Controller, '_checked', check)
+    gain = Parameter('adaptive.insertion.kp', value=901.0).to_parameter_msg()
+    answer = client.call_async(SetParametersAtomically.Request(parameters=[gain]))
+    ros_graph.spin_until(begun.is_set, 'the check')
+    transitions = bench.node.create_client(ChangeState, 'controller/change_state')
+    ros_graph.spin_until(transitions.service_is_ready, 'the service')
+    for number in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
+        done = transitions.call_async(ChangeState.Request(transition=Transition(id=number)))
+        ros_graph.spin_until(done.done, 'the transition')
+        assert done.result().success
+    assert not answer.done()
+    go_on.set()
+    ros_graph.spin_until(answer.done, 'the change')
+    assert answer.result().result.successful
+    assert bench.controller.start()
+    assert bench.controller.values()['adaptive.insertion.kp'] == 901.0
 
 
 @pytest.mark.requirement('S-072')
