@@ -118,8 +118,12 @@ def check_times(times: Sequence[float]) -> None:
     """Check that times of trajectory points [s] are non-negative and increasing."""
     if not times:
         raise ParameterError('trajectory has no points')
-    if times[0] < 0.0 or any(late <= early for early, late in pairwise(times)):
-        raise ParameterError(f'trajectory times must be >= 0 and increasing, got {list(times)} s')
+    rule = 'trajectory times must be >= 0 and increasing'
+    if times[0] < 0.0:
+        raise ParameterError(f'{rule}, got {times[0]:g} s')
+    for early, late in pairwise(times):
+        if late <= early:
+            raise ParameterError(f'{rule}, got {late:g} s after {early:g} s')
 
 
 class ErrorCode(IntEnum):

@@ -127,10 +127,11 @@ class Path:
             raise ParameterError('times, positions and velocities must be finite')
         check_times(times)
         low, high = depths
-        if not all(low <= at <= high for at in positions):
-            raise ParameterError(
-                f'positions must be in [{low:g}, {high:g}] m, got {list(positions)} m'
-            )
+        for at, time in zip(positions, times, strict=True):
+            if not low <= at <= high:
+                raise ParameterError(
+                    f'positions must be in [{low:g}, {high:g}] m, got {at:g} m at {time:g} s'
+                )
         #: Start time, position, velocity, acceleration and jerk of each piece.
         self._pieces: list[tuple[float, float, float, float, float]] = []
         #: Times of the first point and of the end [s], and insertion depth at the end [m].
@@ -174,32 +175,35 @@ class Path:
         if velocities[-1] != 0.0:
             raise ParameterError(f'velocity at the end must be 0, got {velocities[-1]:g} m/s')
         (low, high), limits = self.depths, self._limits
-        for k in range(len(times) - 1):
-            t = times[k + 1] - times[k]
-            p, d, v0, v1 = positions[k], positions[k + 1] - positions[k], *velocities[k : k + 2]
+        start, all_p, all_v = (np.array(x, dtype=float) for x in (times, positions, velocities))
+        t, p, d, v0, v1 = np.diff(start), all_p[:-1], np.diff(all_p), all_v[:-1], all_v[1:]
+        # Without a jerk, an acceleration or a turn, quotients are infinite or NaN: outside of t.
+        with np.errstate(all='ignore'):
             a = (6.0 * d / t - 4.0 * v0 - 2.0 * v1) / t
             jerk = (6.0 * (v0 + v1) - 12.0 * d / t) / (t * t)
-            inside = -a / jerk if jerk else -1.0
-            peaks = [abs(v0), abs(v1)]
-            if 0.0 < inside < t:
-                peaks.append(abs(v0 + 0.5 * a * inside))
-            for name, unit, found, bound in (
-                ('speed', 'm/s', max(peaks), limits.speed),
-                ('acceleration', 'm/s^2', max(abs(a), abs(a + jerk * t)), limits.acceleration),
-            ):
-                if found > bound * (1.0 + ROUNDING):
-                    raise ParameterError(
-                        f'{name} after {times[k]:g} s must be within {bound:g} {unit}, got '
-                        f'{found:g} {unit}'
-                    )
-            for turn in np.roots([0.5 * jerk, a, v0]):
-                x = float(turn.real)
-                at = p + x * (v0 + x * (0.5 * a + x * jerk / 6.0))
-                if turn.imag == 0.0 and 0.0 < x < t and not low <= at <= high:
-                    raise ParameterError(
-                        f'path must stay in [{low:g}, {high:g}] m, got {at:g} m between its points'
-                    )
-            self._pieces.append((times[k], p, v0, a, jerk))
+            peak = -a / jerk
+            between = np.where((peak > 0.0) & (peak < t), v0 + 0.5 * a * peak, 0.0)
+            q = -0.5 * (a + np.copysign(np.sqrt(a * a - 2.0 * jerk * v0), a))
+            turns = np.stack([2.0 * q / jerk, v0 / q])
+            last = a + jerk * t
+            turning = p + turns * (v0 + turns * (0.5 * a + turns * jerk / 6.0))
+        for name, unit, values, bound in (
+            ('speed', 'm/s', (v0, v1, between), limits.speed),
+            ('acceleration', 'm/s^2', (a, last), limits.acceleration),
+        ):
+            found = np.abs(values).max(axis=0)
+            for k in np.flatnonzero(~(found <= bound * (1.0 + ROUNDING)))[:1].tolist():
+                raise ParameterError(
+                    f'{name} after {times[k]:g} s must be within {bound:g} {unit}, got '
+                    f'{found[k]:g} {unit}'
+                )
+        inside = (turns > 0.0) & (turns < t)
+        for at in turning[inside & ~((low <= turning) & (turning <= high))][:1].tolist():
+            raise ParameterError(
+                f'path must stay in [{low:g}, {high:g}] m, got {at:g} m between its points'
+            )
+        pieces = (one.tolist() for one in (start[:-1], p, v0, a, jerk))
+        self._pieces += zip(*pieces, strict=True)
         self._pieces.append((times[-1], positions[-1], 0.0, 0.0, 0.0))
 
     def at(self, time: float) -> Setpoint:

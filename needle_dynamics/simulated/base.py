@@ -80,17 +80,19 @@ class BaseMotion:
         low, high = self._range
         ends = [force for at, force in zip_longest(depths, forces) if at is None]
         # Written so that NaN is rejected too.
-        if not all(low <= at <= high for at in depths if at is not None):
-            raise ParameterError(
-                f'{self._joint} must stay in [{low:g}, {high:g}] {self._unit}, got '
-                f'{list(depths)} {self._unit}'
-            )
-        if None in ends:
-            raise ParameterError('each point needs a position or an effort')
-        if not all(abs(force) <= self._force_limit for force in ends if force is not None):
-            raise ParameterError(
-                f'a push must be within {self._force_limit:g} N, got {list(forces)} N'
-            )
+        unit = self._unit
+        for at in depths:
+            if at is not None and not low <= at <= high:
+                raise ParameterError(
+                    f'{self._joint} must stay in [{low:g}, {high:g}] {unit}, got {at:g} {unit}'
+                )
+        for force in ends:
+            if force is None:
+                raise ParameterError('each point needs a position or an effort')
+            if not abs(force) <= self._force_limit:
+                raise ParameterError(
+                    f'a push must be within {self._force_limit:g} N, got {force:g} N'
+                )
         # A point at the start time replaces the point for the present position.
         first = [] if times[0] == 0.0 else [(0.0, depth, self._force, False)]
         points = [

@@ -2,6 +2,7 @@
 """References keep their limits, are continuous with the state before, and reach their target."""
 
 from collections.abc import Callable
+from itertools import accumulate, pairwise
 from typing import Any
 
 from hypothesis import assume, given, settings
@@ -14,6 +15,7 @@ from needle_dynamics import FloatArray, ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 
 LIMITS = ReferenceLimits(speed=0.01, acceleration=0.1)
 BOTH = pytest.mark.parametrize('kind', [Trapezoid, MinimumJerk])
@@ -210,6 +212,43 @@ def test_infeasible_paths_are_rejected(
     """In one line, with the invalid and the valid values."""
     with pytest.raises(ParameterError, match=reason):
         Path(times, positions, rates, LIMITS, REACH)
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    st.lists(
+        st.tuples(st.floats(0.05, 2.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+        min_size=1,
+        max_size=5,
+    ),
+    st.sampled_from([1e-3, 5e-3, 2e-2]),
+    st.sampled_from([0.1, REACH[1] - 1e-5]),
+)
+def test_cubics_are_accepted_if_and_only_if_they_are_within_limits(
+    points: list[tuple[float, float, float]], size: float, start: float
+) -> None:
+    """As the cubic spline of SciPy, at 401 times between two points."""
+    times = [0.0, *accumulate(step for step, _, _ in points)]
+    positions = [start, *(min(start + size * x, REACH[1]) for _, x, _ in points)]
+    rates = [0.0, *(size * v for *_, v in points[:-1]), 0.0]
+    spline = CubicHermiteSpline(times, positions, rates)
+    sampled = np.concatenate([np.linspace(*pair, 401)[:-1] for pair in pairwise(times)])
+    fastest = np.abs(spline(sampled, 1)).max()
+    # Acceleration is linear between the points, and jumps there.
+    ends = [*times[:-1], *np.nextafter(times[1:], 0.0)]
+    excess = max(fastest / LIMITS.speed, np.abs(spline(ends, 2)).max() / LIMITS.acceleration) - 1.0
+    beyond = max(spline(sampled).max() - REACH[1], REACH[0] - spline(sampled).min())
+    # Peaks between the sampled times: second order in their step.
+    assume(abs(excess) > 1e-4 and not -4e-7 < beyond <= 0.0)
+    try:
+        path = Path(times, positions, rates, LIMITS, REACH)
+    except ParameterError:
+        assert excess > 0.0 or beyond > 0.0
+    else:
+        assert excess <= 0.0
+        assert beyond <= 0.0
+        found = [path.at(t).position for t in sampled.tolist()]
+        assert_allclose(found, spline(sampled), rtol=1e-9)
 
 
 class Walk:

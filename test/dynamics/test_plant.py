@@ -183,13 +183,13 @@ def test_encoder_rounds_to_the_nearest_count(resolution: float) -> None:
 @pytest.mark.parametrize(
     ('points', 'complaint'),
     [
-        ([(1.0, 0.3, None)], r'trajectory must stay in \[0.001, 0.2\] m, got \[0.3\] m'),
+        ([(1.0, 0.3, None)], r'trajectory must stay in \[0.001, 0.2\] m, got 0.3 m'),
         ([(1.0, nan, None)], 'trajectory must stay in'),
-        ([(1.0, None, inf)], r'a push must be within 1000 N, got \[inf\] N'),
+        ([(1.0, None, inf)], 'a push must be within 1000 N, got inf N'),
         ([(1.0, None, nan)], 'a push must be within 1000 N'),
         ([(1.0, None, 1.0), (2.0, None, None)], 'each point needs a position or an effort'),
-        ([(-1.0, 0.1, None)], r'trajectory times must be >= 0 and increasing, got \[-1.0\] s'),
-        ([(1.0, 0.1, None), (1.0, 0.1, None)], 'trajectory times must be >= 0 and increasing'),
+        ([(-1.0, 0.1, None)], r'trajectory times must be >= 0 and increasing, got -1 s'),
+        ([(1.0, 0.1, None), (1.0, 0.1, None)], 'and increasing, got 1 s after 1 s'),
     ],
 )
 def test_invalid_trajectories_have_no_effect(points: list[Any], complaint: str) -> None:

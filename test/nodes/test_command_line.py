@@ -73,8 +73,10 @@ def test_blas_threads_of_started_nodes_are_limited(ros_graph: RosGraph) -> None:
     """Also without the programs of pip and ros2 run, as in `needle run`."""
     ros_graph.environment.pop('OMP_NUM_THREADS', None)
     node = ros_graph.start('plant')
-    environment = Path(f'/proc/{node.process.pid}/environ').read_text()
-    assert 'OMP_NUM_THREADS=1' in environment.split('\0')
+    environment = Path(f'/proc/{node.process.pid}/environ')
+    # Empty while the program is being loaded.
+    ros_graph.spin_until(environment.read_text, 'the environment')
+    assert 'OMP_NUM_THREADS=1' in environment.read_text().split('\0')
 
 
 def test_unknown_argument_is_rejected(ros_graph: RosGraph) -> None:

@@ -293,7 +293,7 @@ def test_position_controller_is_followed(ros_graph: RosGraph, tmp_path: Path) ->
     driver.until(lambda: driver.refused > 0, 'the refusal')
     assert driver.at() == pytest.approx(0.04, abs=2e-6)
     said = driver.said()
-    assert 'joint_commands: trajectory must stay in [0.001, 0.2] m, got [0.3] m' in said
+    assert 'joint_commands: trajectory must stay in [0.001, 0.2] m, got 0.3 m' in said
 
 
 @pytest.mark.requirement('S-286')
