@@ -176,7 +176,7 @@ class TrajectoryAction:
     def update(
         self, stamp: int, followed: Mapping[str, FollowedJoint], paused: Collection[str] = ()
     ) -> None:
-        """Check the goals at a sample with a stamp [ns], except for those of paused joints."""
+        """Check the goals at a sample with a stamp [ns], except for paused joints."""
         elapsed, self._updated = stamp - self._updated, stamp
         for execution in [*self._running.values()]:
             goal = execution.goal
@@ -241,7 +241,7 @@ class TrajectoryClient:
             raise ParameterError(f'the action {action} needs control_msgs: install it') from None
         self._action, self._take = action, take
         self._client = ActionClient(node, self._kind, action)
-        self._last = JointTrajectory()  #: The last trajectory; it supersedes older ones.
+        self._last = JointTrajectory()  #: The last trajectory, which supersedes all others.
 
     def destroy(self) -> None:
         self._client.destroy()
@@ -255,7 +255,7 @@ class TrajectoryClient:
             future.add_done_callback(partial(self._on_response, trajectory))
 
     def _report(self, verdict: Verdict | None = None, reason: str = '') -> None:
-        """Report the answer to the last trajectory, or that there is none."""
+        """Report the answer to the last trajectory, or its absence."""
         topic, stamp = JOINT_TRAJECTORY.name, nanoseconds(self._last.header.stamp)
         answers = () if verdict is None else (Acknowledgement(topic, stamp, verdict, reason),)
         self._take(self._action, RequestStatus({topic: tuple(self._last.joint_names)}, answers))

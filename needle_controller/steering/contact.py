@@ -99,7 +99,7 @@ class MonitoredLaw:
     limits : SteeringLimits
         Limits of the guide.
     settings : ContactSettings
-        Limit of the probability, and what happens above it.
+        Limit of the probability, and reaction above it.
 
     Raises
     ------
@@ -253,7 +253,7 @@ class MonitoredLaw:
             return _Contact(0.0, 0.0)
         self._needle.move(guide=to[:2])
         shape, _ = inserted_shape(self._needle, shaft.places)
-        # The nominal needle is moved by the guide as far as the tissue is known.
+        # The nominal needle, moved by the guide within the tissue that is known.
         doubt = (self._model.prior.spread * (shape - shaft.tips)) ** 2
         covariance = self._covariance(shaft.covariance + doubt[:, np.newaxis] * np.eye(2))
         every = probability_outside(shaft.free, shape + shaft.off, covariance)
@@ -263,7 +263,7 @@ class MonitoredLaw:
         return of_tip + (_LEAST + self._settings.registration**2) * np.eye(2)
 
     def _best_path(self, forecast: Forecast) -> PlannedPath | None:
-        """Return the path to the target with the largest clearance, None if there is none."""
+        """Return the path to the target with the largest clearance, or None."""
         first, shaft, needle = self.step - 1, self._shaft, self._needle
         at = self._model.depths[first:]
         moves = forecast.response[first:, first:]

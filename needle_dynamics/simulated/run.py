@@ -30,7 +30,7 @@ PARAMETERS: Final = 'parameters'
 TARE: Final = 'tare'
 RESET: Final = 'reset'
 
-_HALT: Final = 0.05  #: time in which joints come to rest at their positions [s]
+_HALT: Final = 0.05  #: time in which joints settle at their positions [s]
 _JOINED: Final = 1e-4  #: distance from a command at which a joint follows again [m or rad]
 _WITHDRAWAL: Final = 0.01  #: mean velocity of a retraction [m/s]
 _ROUNDING: Final = 2  #: tolerance of the period due to the rounding of stamps [ns]
@@ -170,7 +170,7 @@ class PlantRun:
             self._follow(joints, 0.0, [ends[name] for name in joints], [])
 
     def _braked(self, depth: float, velocity: float) -> float:
-        """Return where the needle holds: if it is withdrawn, where the base comes to rest [m]."""
+        """Return the depth of the needle at rest [m]; withdrawn, where the base stops."""
         # A return to the present depth would insert it.
         outward, constants = min(velocity, 0.0), self.constants
         distance = outward**2 / (2.0 * constants.base.acceleration_limit)

@@ -46,7 +46,7 @@ class MatrixFit(NamedTuple):
 
     matrix: FloatArray = np.full((2, 2), nan)  # K [N/m]; undetermined columns are nan
     known: BoolArray = np.zeros(2, dtype=np.bool_)  # (2,) columns that the presses determine
-    #: R_rs A_r A_s^T is the covariance of rows r, s of K; R is that of the residuals of the rows.
+    #: R_rs A_r A_s^T is the covariance of rows r, s of K, and R the covariance of their residuals.
     factors: FloatArray = np.zeros((2, 2, 2))
     correlation: FloatArray = np.eye(2)
     degrees_of_freedom: float = 0.0  # of each row
@@ -186,14 +186,14 @@ def _differ(fit: MatrixFit, found: FloatArray, stretch: FloatArray, slide: Float
 
 
 def asymmetry(matrix: ArrayLike) -> float:
-    """Return the norm of the antisymmetric part of a matrix over that of the symmetric part."""
+    """Return the ratio of the norms of the antisymmetric and the symmetric part of a matrix."""
     k = np.asarray(matrix, dtype=np.float64)
     symmetric = float(norm(k + k.T))
     return float(norm(k - k.T)) / symmetric if symmetric else nan
 
 
 def rotation_estimate(fit: MatrixFit) -> ParameterEstimate:
-    """Return the rotation of the axes of force against those of motion that makes K symmetric."""
+    """Return the rotation of the force axes against the motion axes that makes K symmetric."""
     k = fit.matrix
     curl, trace = float(k[1, 0] - k[0, 1]), float(k[0, 0] + k[1, 1])
     size = curl**2 + trace**2 or nan

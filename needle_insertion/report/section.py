@@ -154,7 +154,7 @@ class Section:
 def section(
     anatomies: Sequence[Anatomy], legend: Legend, clearance: Clearance, radius: float, plane: Plane
 ) -> Section:
-    """Return the section of images; `clearance` is that of a needle with the radius [m]."""
+    """Return the section of images; `clearance` is for a needle with the radius [m]."""
     points = plane.points
     numbers = sample(anatomies, legend.structures, points)
     obstacles = sum(one.role == ROLES[0] for one in legend.structures)
@@ -173,7 +173,7 @@ def draw_section(axes: Axes, shown: Section, legend: Legend, line: FloatArray) -
     from matplotlib.colors import to_rgb
 
     numbers = shown.numbers
-    # The last ones have the numbers -2 and -1.
+    # The last two have the numbers -2 and -1.
     image = np.array([to_rgb(one) for one in (*legend.colors, OUTSIDE_COLOR, _FREE)])[numbers]
     rows, columns = np.indices(numbers.shape)
     stripes = shown.margin & ((rows + columns) % _STRIPES < 2)
@@ -291,6 +291,6 @@ class _Labels:
                 if self.fits(at, text):
                     self.put(at[0], at[1], text)
                     break
-                # The next place is not near this one.
+                # The next place is not near the present place.
                 rows, columns = (slice(max(0, k - radius), k + radius + 1) for k in (row, column))
                 inner[rows, columns] = 0.0
