@@ -404,10 +404,10 @@ class Controller:
             if self.guide.moves:
                 notice = f'measurements continued after {gap:.3f} s; the motion starts again'
             self.release()
-        if measured.is_finite():
+        if measured.is_finite() and isfinite(load):
             fault = self._displacement.fault(measured.time, measured.depth, measured.velocity)
         else:
-            fault = f'joint_states must be finite, got {measured}'
+            fault = f'joint_states and load must be finite, got {measured}, {load:g} N'
         if fault is None:
             notice = self._returned(measured) or notice
             moves = self.target is not None and not self.guide.paused

@@ -42,6 +42,7 @@ from needle_ros.status import Diagnosis, IdentificationStatus
 from needle_ros.wire import Reading
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
+from rclpy.exceptions import InvalidServiceNameException
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.service import Service
@@ -148,17 +149,20 @@ class IdentificationNode(BaseNode):
             import_module('scipy.stats')
         self._force_axis = signed_axis(self.text('force_axis'), 'force_axis')
         self._joint = signed(self.text('motion_axis') or contract.INSERTION)
-        if len(self.get_parameter('axes').value) != 2:
-            raise ParameterError(f'axes must be two, got {list(self.get_parameter("axes").value)}')
-        self._bags = [name for name in self.get_parameter('bags').value if name]
-        self._setters = {
-            name: self.create_client(SetParameters, f'{name}/set_parameters')
-            for name in self.get_parameter('apply_to').value
-        }
+        if len(axes := self.value('axes')) != 2:
+            raise ParameterError(f'axes must be two, got {axes}')
+        self._bags = [name for name in self.value('bags') if name]
+        self._setters = {name: self._setter(name) for name in self.value('apply_to')}
         self._friction = self.publisher(contract.FRICTION, always=True)
         self._stiffness = self.publisher(contract.STIFFNESS, always=True)
         self.create_service(Trigger, '~/identify', self._on_identify)
         _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
+
+    def _setter(self, name: str) -> Client:
+        try:
+            return self.create_client(SetParameters, f'{name}/set_parameters')
+        except InvalidServiceNameException as error:
+            raise ParameterError(f'apply_to must have names of nodes, got {name!r}') from error
 
     def cleanup(self) -> None:
         self._calls.abandon()
@@ -238,7 +242,7 @@ class IdentificationNode(BaseNode):
             found, publisher = friction.statistics, self._friction
             write = partial(write_result, friction=friction)
         else:
-            reading['axes'] = tuple(self.get_parameter('axes').value)
+            reading['axes'] = tuple(self.value('axes'))
             read = partial(read_indentation_recording, **reading)
             settings = self.settings('stiffness.', StiffnessSettings)
             summary = stiffness = summarize_stiffness(

@@ -221,7 +221,7 @@ class BaseNode(ParameterNode):
         return bool(super().destroy_timer(timer))
 
     def _after_change(self, _parameters: list[Parameter]) -> None:
-        if self._configured:
+        if self._configured and self._changed:
             self._configuration.publish(String(data=self.configuration()))
 
     # Lifecycle: rclpy calls the methods `on_...`.

@@ -57,6 +57,7 @@ class ParameterNode(LifecycleNode):
         #: Parameters that a file sets for several nodes: each declares some of them.
         self.shared: frozenset[str] = frozenset()
         self._configured = False
+        self._changed = False  #: Whether the last accepted parameters had new values.
         self.add_on_set_parameters_callback(self._check_change)
         self._parameter_services = ParameterServices(self)
 
@@ -165,15 +166,19 @@ class ParameterNode(LifecycleNode):
         return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False))
 
     def values(self) -> dict[str, Any]:
-        values = {}
-        for name, parameter in sorted(self._parameters.items()):
-            value = parameter.value
-            if value is None or isinstance(value, (list, tuple, array)):
-                # rcl returns an empty list of a parameter file as None.
-                value = list(value or ())
-            if not name.startswith(('qos_overrides', 'start_type')):
-                values[name] = self._meant(name, value)
-        return values
+        hidden = ('qos_overrides', 'start_type')
+        return {
+            name: self.value(name)
+            for name in sorted(self._parameters)
+            if not name.startswith(hidden)
+        }
+
+    def value(self, name: str) -> Any:
+        """Return the value of a parameter; rcl returns an empty list of a file as None."""
+        value = self._parameters[name].value
+        if value is None or isinstance(value, (list, tuple, array)):
+            value = list(value or ())
+        return self._meant(name, value)
 
     def _is_valid(self) -> bool:
         try:
@@ -198,14 +203,14 @@ class ParameterNode(LifecycleNode):
 
     def _changes(self, parameters: list[Parameter]) -> dict[str, Any]:
         """Return the new values; others are accepted: a whole file can be loaded again."""
-        now = self.values()
         given = {one.name: self._meant(one.name, one.value) for one in parameters}
-        return {name: new for name, new in given.items() if not _same(new, now.get(name))}
+        return {name: new for name, new in given.items() if not _same(new, self.value(name))}
 
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
         if not self._configured:
             return SetParametersResult(successful=True)
         changes = self._changes(parameters)
+        self._changed = bool(changes)
         fixed = ', '.join(name for name in changes if name not in self.LIVE)
         if fixed:
             reason = f'{fixed}: cannot change while configured; clean up the node first'

@@ -45,7 +45,8 @@ class DeferredService:
 
 
 class _Change(NamedTuple):
-    steps: Iterator[Callable[[], object]]  #: its long checks
+    #: Its long checks; None where other callbacks may be executed.
+    steps: Iterator[Callable[[], object] | None]
     send: Callable[[], None]
 
 
@@ -80,27 +81,36 @@ class ParameterServices:
 
     def _steps(
         self, groups: list[list[Parameter]], keep: Callable[[SetParametersResult], None]
-    ) -> Iterator[Callable[[], object]]:
-        for group in groups:
+    ) -> Iterator[Callable[[], object] | None]:
+        for k, group in enumerate(groups):
+            if k > 0:
+                # A whole parameter file takes long.
+                yield None
             if (check := self._node.long_check(group)) is not None:
                 yield check
             keep(self._node.set_parameters_atomically(group))
 
     def _continue(self) -> bool:
-        """Continue the oldest change; return whether it is complete, or a thread checks it."""
-        if (check := next(self._changes[0].steps, None)) is None:
-            self._changes.popleft()
-            return True
-        Thread(target=self._run, args=(check,), name='check', daemon=True).start()
-        return False
+        """Continue the oldest change; return whether it is complete, or continued later."""
+        for check in self._changes[0].steps:
+            if check is None:
+                self._continue_later()
+            else:
+                Thread(target=self._run, args=(check,), name='check', daemon=True).start()
+            return False
+        self._changes.popleft()
+        return True
 
     def _run(self, check: Callable[[], object]) -> None:
         leave_realtime()
         try:
             check()
         finally:
-            if (executor := self._node.executor) is not None:
-                executor.create_task(self._resume)
+            self._continue_later()
+
+    def _continue_later(self) -> None:
+        if (executor := self._node.executor) is not None:
+            executor.create_task(self._resume)
 
     def _resume(self) -> None:
         while self._changes:

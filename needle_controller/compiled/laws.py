@@ -240,14 +240,13 @@ def _aim(c: LawConstants, memory: FloatArray, at: Instant) -> Instant:
 
 
 @inlined
-def _learned(c: LawConstants, memory: FloatArray, aim: Instant) -> float:
-    """Return the learned additional friction of the motion to follow [N]."""
+def _learned(c: LawConstants, memory: FloatArray, position: float, soon: float) -> float:
+    """Return the learned additional friction [N] at a position and the velocity shortly after."""
     if c.bound == 0.0:
         return 0.0
-    soon = aim.target_velocity + c.ahead * aim.target_acceleration
     first = LEARNED if soon > 0.0 else LEARNED + BLOCK
     most = bounds(c.bound, c.coulomb, c.viscous)
-    found = correction(memory[first : first + BLOCK], most, aim.target, abs(soon))
+    found = correction(memory[first : first + BLOCK], most, position, abs(soon))
     return found * min(max(soon / c.breakaway_speed, -1.0), 1.0)
 
 
@@ -271,6 +270,7 @@ def adapt(
     sign = 1.0 if mean > 0.0 else -1.0
     first = LEARNED if mean > 0.0 else LEARNED + BLOCK
     modeled = friction_force(_friction(c), mean, 0.0) + c.inertia * (velocity - rate) / c.period
+    known = _learned(c, memory, memory[POSITION], memory[VELOCITY])
     learn(
         memory[first : first + BLOCK],
         bounds(c.bound, c.coulomb, c.viscous),
@@ -280,6 +280,17 @@ def adapt(
         c.noise,
         c.period,
     )
+    if memory[FOLLOWS] == 1.0 and c.ki > 0.0:
+        # The integral has compensated what is learned now: their sum does not change.
+        more = _learned(c, memory, memory[POSITION], memory[VELOCITY]) - known
+        memory[INTEGRAL] -= more * _divisor(c, c.pf, c.vf) / c.ki
+
+
+@inlined
+def _divisor(c: LawConstants, pf: float, vf: float) -> float:
+    """Return the factor by which implicit feedback reduces its force, for a response pf, vf."""
+    h = c.period
+    return 1.0 + (c.kp + h * c.ki) * pf + c.kd * h / (c.filter_time + h) * vf
 
 
 @inlined
@@ -297,7 +308,7 @@ def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
     share = h / (c.filter_time + h)
     rate = (1.0 - share) * memory[RATE]
     stiffness, slope = c.kp + h * c.ki, share * vf
-    divisor = 1.0 + stiffness * pf + c.kd * slope
+    divisor = _divisor(c, pf, vf)
     if c.kind == PID:
         end = aim.target + h * aim.target_velocity
         rate += share * (reached - vv * aim.velocity)
@@ -309,7 +320,8 @@ def _implicit(c: LawConstants, memory: FloatArray, aim: Instant) -> _Implicit:
         rate += share * vv * slower
         push = stiffness * (aim.target - aim.position + pv * slower)
     push += c.kd * rate + c.ki * memory[INTEGRAL] + memory[OFFSET]
-    forward = _learned(c, memory, aim)
+    soon = aim.target_velocity + c.ahead * aim.target_acceleration
+    forward = _learned(c, memory, aim.target, soon)
     if c.kind == PID and c.feed_forward != 0.0:
         push += linear
     if c.feed_forward != 0.0:

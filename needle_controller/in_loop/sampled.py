@@ -185,7 +185,7 @@ def run_batch(
     """
     Run sampled laws of insertion on many needles, on all cores; see `run_controller`.
 
-    The loop is compiled and supports the laws of this package: `InverseDynamics` and `Pid`.
+    The loop is compiled and supports the laws of this package.
     Rotation is not coupled to insertion and is at rest. The laws do not compensate the load.
 
     Parameters
@@ -235,21 +235,21 @@ def run_batch(
     if len(periods) > 1:
         raise ParameterError(f'laws must have the same period, got {sorted(periods)} s')
     period = periods.pop()
-    if not (isfinite(duration) and duration >= period and step > 0.0 and min(delay, late) >= 0):
+    positive = step > 0.0 and limit > 0.0 and min(delay, late) >= 0
+    if not (isfinite(duration) and duration >= period and positive):
         raise ParameterError(
-            f'duration must be finite and >= {period:g} s, step > 0, delay and late >= 0, got '
-            f'{duration!r}, {step!r}, {delay!r} and {late!r}'
+            f'duration must be finite and >= {period:g} s, step and limit > 0, delay and late '
+            f'>= 0, got {duration!r}, {step!r}, {limit!r}, {delay!r} and {late!r}'
         )
     count = round(duration / period)
     # Setpoint of a command: the reference at the time of its effect.
     motion = _setpoints(reference, period, count + delay + 1)
     setpoints, goal = motion[delay:-1], np.ascontiguousarray(motion[: count + 1, 0])
-    blurred = np.array(noise, dtype=np.float64).reshape(-1, 3)
-    if len(blurred) not in (0, count) or not np.isfinite(blurred).all():
-        raise ShapeError(f'noise must be finite, of shape ({count}, 3), got {blurred.shape}')
-    along = np.array(added, dtype=np.float64).reshape(-1, 3)
-    if not np.isfinite(along).all() or (np.diff(along[:, 0]) <= 0.0).any():
-        raise ParameterError(f'added must be finite, with increasing lengths, got {added!r}')
+    blurred, along = _rows('noise', noise), _rows('added', added)
+    if len(blurred) not in (0, count):
+        raise ShapeError(f'noise must be of shape ({count}, 3), got {blurred.shape}')
+    if (np.diff(along[:, 0]) <= 0.0).any() or (along[:, 1:] < 0.0).any():
+        raise ParameterError(f'added must have increasing depths and friction >= 0, got {added!r}')
     models = [NeedleModel(p) for p in each]
     needles = [model.compiled for model in models]
     ends = np.array(
@@ -282,6 +282,19 @@ def run_batch(
     return LoopBatch(
         final, largest, np.sqrt(squares), ends, completed, goal, depths, trajectories, commands
     )
+
+
+def _rows(name: str, values: ArrayLike) -> FloatArray:
+    """Return finite values as rows, shape (n, 3); empty values have no rows."""
+    try:
+        rows = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ShapeError(f'{name} must be numbers, got {values!r}') from error
+    if rows.size == 0:
+        return np.empty((0, 3))
+    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
+        raise ShapeError(f'{name} must be finite, of shape (n, 3), got {rows.shape}')
+    return rows
 
 
 class LoopInsertion(NamedTuple):

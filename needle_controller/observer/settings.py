@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_discrete_lyapunov, solve_triangular
 
 _SENSOR: Final = ForceSensorParameters()  #: Default force sensor of the plant, assumed by default.
+_SLOWEST: Final = 1e-4  #: Least cutoff over the filter rate: slower filters are singular.
 
 
 @lru_cache(maxsize=32)
@@ -124,10 +125,11 @@ class ObserverSettings:
             cutoffs = tuple(float(value) for value in self.cutoffs)
         except (TypeError, ValueError):
             cutoffs = (nan,)
-        if not all(0.0 < value < self.filter_rate / 2.0 for value in cutoffs):
+        low, high = _SLOWEST * self.filter_rate, 0.5 * self.filter_rate
+        if not all(low <= value < high for value in cutoffs):
             raise ParameterError(
-                f'cutoffs must be > 0 and below half the filter_rate = '
-                f'{self.filter_rate / 2.0:g} Hz each, got {self.cutoffs!r}'
+                f'cutoffs must be in [{low:g}, {high:g}) Hz each, at filter_rate = '
+                f'{self.filter_rate:g} Hz, got {self.cutoffs!r}'
             )
         object.__setattr__(self, 'cutoffs', cutoffs)
 

@@ -21,8 +21,8 @@ _PEAK: Final = 1.875  #: Highest speed of a smooth motion from rest to rest over
 #: between its points add 5 %.
 _STEEPEST: Final = 1.05 * 10.0 / sqrt(3.0)
 
-_POINTS: Final = 20  #: Fewest points of a motion.
-_INTERVAL: Final = 0.05  #: Longest time from one point of a motion to the next [s].
+_POINTS: Final = 20, 1000  #: Fewest and most points of a motion.
+_INTERVAL: Final = 0.05  #: Time from one point of a motion to the next within these bounds [s].
 
 #: Displacement of a joint that follows, unless its tolerance is less [m, rad].
 _MOVED: Final = 1e-4
@@ -44,7 +44,8 @@ def smooth(
     joints: tuple[str, ...], begin: FloatArray, end: FloatArray, duration: float
 ) -> JointMotion:
     """Return a minimum-jerk motion from rest to rest [m, rad] in a duration [s]."""
-    count = max(_POINTS, ceil(duration / _INTERVAL))
+    fewest, most = _POINTS
+    count = ceil(min(max(duration / _INTERVAL, fewest), most))
     times = duration * (np.arange(1, count + 1) / count)
     unit, shift = Quintic(Setpoint(0.0), Setpoint(1.0), duration), end - begin
     parts, rates, _ = np.array([unit.at(time) for time in times.tolist()]).T

@@ -24,6 +24,15 @@ _SAME: Final = 1e-6  #: Tolerance of equal numbers of steps.
 _MOST_STEPS: Final = 200  #: Most steps of a plan.
 
 
+def check_steps(steps: int, length: float, name: str) -> None:
+    """Raise `ParameterError` for more steps of a length [m], a setting, than are possible."""
+    if steps > _MOST_STEPS:
+        raise ParameterError(
+            f'it would take {steps} steps of {1e3 * length:g} mm, at most {_MOST_STEPS} are '
+            f'possible: increase {name}'
+        )
+
+
 @dataclass(slots=True, eq=False)
 class InsertionPlanner:
     """Compute the law of an insertion, one at a time; arguments as for `SteeringExecutive`."""
@@ -116,11 +125,7 @@ class InsertionPlanner:
         if self.plan is not None:
             return self.plan.tip_path.since(depth).depths
         steps = max(1, ceil((point[1] - depth) / settings.step_length - _SAME))
-        if steps > _MOST_STEPS:
-            raise ParameterError(
-                f'it would take {steps} steps of {1e3 * settings.step_length:g} mm, at most '
-                f'{_MOST_STEPS} are possible: increase step_length'
-            )
+        check_steps(steps, settings.step_length, 'step_length')
         return np.linspace(depth, point[1], steps + 1)
 
     def start(self, request: PlannedInsertion) -> None:

@@ -68,30 +68,47 @@ class _Channels:
         elif opcode == Opcode.STATISTICS:
             self.counts = Statistics.read(stream).channel_message_counts
 
+    def recover(self, file: Path) -> bytes:
+        """Define the topics after the loss of a chunk, which may have contained them."""
+        with suppress(*DAMAGED_MCAP):
+            self.define_by_index(file)
+        return b''
+
+    def define_by_index(self, file: Path) -> None:
+        """Define all topics of the index at the end of a file, if it has a valid one."""
+        summary = _summary(file)
+        for begin, end in _records(summary):
+            for first, after in zip(begin.tolist(), end.tolist(), strict=True):
+                self.define(summary[first - _HEAD.size], summary[first:after])
+
 
 def indexed_topics(file: Path) -> set[BagTopic] | None:
     """Return the topics with messages by the index of a file; None without a valid index."""
     channels = _Channels()
     try:
-        with file.open('rb') as stream:
-            stream.seek(-_TAIL.size, 2)
-            footer, _, start, _, checksum, magic = _TAIL.unpack(stream.read())
-            if (footer, magic) != (Opcode.FOOTER, _MAGIC) or not start or not checksum:
-                return None
-            stream.seek(start)
-            # The checksum covers all bytes before it.
-            summary = stream.read(_SUMMARY)[: -4 - len(_MAGIC)]
-        if zlib.crc32(summary) != checksum:
-            return None
-        for begin, end in _records(summary):
-            for first, after in zip(begin.tolist(), end.tolist(), strict=True):
-                channels.define(summary[first - _HEAD.size], summary[first:after])
+        channels.define_by_index(file)
         # New publishers of a topic add a channel: the last channel has the QoS of all of them.
         latest = {topic: topic for topic in channels.topics.values()}
         found = {channels.topics[id_] for id_, number in channels.counts.items() if number}
         return {latest[topic] for topic in found} or None
-    except (OSError, *DAMAGED_MCAP):
+    except DAMAGED_MCAP:
         return None
+
+
+def _summary(file: Path) -> bytes:
+    """Return the index at the end of a file, b'' without a valid one."""
+    try:
+        with file.open('rb') as stream:
+            stream.seek(-_TAIL.size, 2)
+            footer, _, start, _, checksum, magic = _TAIL.unpack(stream.read())
+            if (footer, magic) != (Opcode.FOOTER, _MAGIC) or not start or not checksum:
+                return b''
+            stream.seek(start)
+            # The checksum covers all bytes before it.
+            summary = stream.read(_SUMMARY)[: -4 - len(_MAGIC)]
+    except (OSError, *DAMAGED_MCAP):
+        return b''
+    return summary if zlib.crc32(summary) == checksum else b''
 
 
 def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
@@ -117,7 +134,8 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
                     yield from _batches(bytes(loose), channels, tally)
                     loose.clear()
                 if opcode == Opcode.CHUNK:
-                    yield from _batches(_chunk_content(body, length, tally), channels, tally)
+                    content = _chunk_content(body, length, tally) or channels.recover(file)
+                    yield from _batches(content, channels, tally)
             else:
                 tally.budget.spend(0, compression.COSTLY)
                 first = compression.read_up_to(stream, min(length, 8))

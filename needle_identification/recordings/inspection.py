@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inspect a recording: list its content, find force and motion, suggest a command."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -99,6 +99,16 @@ def inspect_recording(path: Path | str) -> Inspection:
     return _table(Path(path)) if tables.is_table(path) else _bag(Path(path))
 
 
+def _guide_moves(table: tables.Table, steered: Mapping[str, str]) -> bool:
+    moving = ('guide_x', 'guide_z', 'roll')
+    given = [role for role in moving if role in steered]
+    try:
+        columns = [tables.column_values(table, role, steered[role], []) for role in given]
+    except RecordingError:
+        return False
+    return any(np.nanmax(values) > np.nanmin(values) for values in columns)
+
+
 def _table(path: Path) -> Inspection:
     table = tables.read_table(path)
     roles = {
@@ -113,13 +123,11 @@ def _table(path: Path) -> Inspection:
     lacking = tables.missing_roles(roles)
     kind, unknown, columns_of = 'friction', '', roles
     steered = steering_columns(table)
-    if lacking and {*STEERING_ROLES} - {*steered} <= {'roll'}:
+    steerable = {*STEERING_ROLES} - {*steered} <= {'roll'}
+    if steerable and (lacking or _guide_moves(table, steered)):
         words = [f'{role} by name and values: {spec}' for role, spec in steered.items()]
         kind, columns_of = 'steering', steered
-        try:
-            check_depth(table, steered['depth'])
-        except RecordingError as error:
-            unknown = str(error).removeprefix(f'{path}: ')
+        unknown = _refusal(table, steered, lambda: check_depth(table, steered['depth']))
     elif lacking:
         unknown = f'no column looks like {" or ".join(lacking)}: name them with --columns'
         columns_of = {role: roles.get(role, 'NAME') for role in tables.ROLES if role != 'speed'}
@@ -129,6 +137,8 @@ def _table(path: Path) -> Inspection:
             for role, spec in roles.items()
         }
         words.append('motion reversed: the force of friction has the sign of the velocity')
+    else:
+        unknown = _refusal(table, roles)
     words += [unknown] * bool(unknown)
     named = ','.join(f'{role}={spec}' for role, spec in columns_of.items())
     return Inspection(
@@ -136,6 +146,19 @@ def _table(path: Path) -> Inspection:
         command=shlex.join(['needle', 'identify', kind, str(path), '--columns', named]),
         lacking=unknown,
     )  # fmt: skip
+
+
+def _refusal(
+    table: tables.Table, columns: Mapping[str, str], check: Callable[[], None] = lambda: None
+) -> str:
+    """Return why columns, such as of unknown unit, are not usable, or ''."""
+    try:
+        check()
+        for role, spec in columns.items():
+            tables.column_values(table, role, spec, [])
+    except RecordingError as error:
+        return str(error).removeprefix(f'{table.path}: ')
+    return ''
 
 
 def _is_reversed(table: tables.Table, roles: Mapping[str, str]) -> bool:

@@ -35,18 +35,44 @@ import numpy as np
 MATLAB: Final = '.mat'
 TABLES: Final = ('.csv', '.tsv', '.txt', '.dat', MATLAB)
 
-_LENGTHS: Final = {'m': 1.0, 'mm': 1e-3, 'cm': 1e-2, 'um': 1e-6, 'µm': 1e-6}
+_INCH: Final = 0.0254  #: [m]
+_MICRO: Final = (
+    'u',
+    'µ',
+    '\u03bc',
+)  #: The letter of 1e-6: also the micro sign and the Greek letter.
+_LENGTHS: Final = {
+    'm': 1.0,
+    'mm': 1e-3,
+    'cm': 1e-2,
+    'in': _INCH,
+    'inch': _INCH,
+    **{f'{micro}m': 1e-6 for micro in _MICRO},
+}
 _ANGLES: Final = {'rad': 1.0, 'deg': pi / 180.0}
 
 #: Units by role, in SI units.
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
-    'time': {'s': 1.0, 'sec': 1.0, 'ms': 1e-3, 'us': 1e-6, 'µs': 1e-6, 'ns': 1e-9, 'min': 60.0},
+    'time': {
+        's': 1.0,
+        'sec': 1.0,
+        'ms': 1e-3,
+        **{f'{micro}s': 1e-6 for micro in _MICRO},
+        'ns': 1e-9,
+        'min': 60.0,
+        'h': 3600.0,
+    },
     'depth': _LENGTHS,
-    'speed': {'m/s': 1.0, 'mm/s': 1e-3, 'cm/s': 1e-2, 'um/s': 1e-6, 'µm/s': 1e-6},
+    'speed': {
+        **{f'{length}/s': size for length, size in _LENGTHS.items()},
+        **{f'{length}/min': size / 60.0 for length, size in _LENGTHS.items()},
+    },
     'force': {'N': 1.0, 'mN': 1e-3, 'kN': 1e3, 'kgf': 9.80665, 'gf': 9.80665e-3, 'lbf': 4.4482216},
     **dict.fromkeys(('guide_x', 'guide_z', 'tip_x', 'tip_y', 'tip_z'), _LENGTHS),
     **dict.fromkeys(('roll', 'tilt_x', 'tilt_z'), _ANGLES),
 }
+
+_ONLY_IN_BRACKETS: Final = ('in', 'h')  #: Units that are usual endings of names.
 
 ROLES: Final = ('time', 'depth', 'speed', 'force')  #: for friction; depth or speed is sufficient
 
@@ -209,15 +235,26 @@ def plain_name(name: str) -> str:
     if match := _BRACKETS.match(name):
         name = match[1]
     front, _, last = name.rpartition('_')
-    if front and any(last in units for units in UNITS.values()):
+    if front and last not in _ONLY_IN_BRACKETS and any(last in one for one in UNITS.values()):
         name = front
     return _WORD.sub('', name.lower())
 
 
 def unit_of(name: str, role: str) -> str | None:
-    match = _BRACKETS.match(name)
-    word = match[2].strip() if match else name.rpartition('_')[2]
+    if match := _BRACKETS.match(name):
+        word = match[2].strip()
+    else:
+        _, _, word = name.rpartition('_')
+        if word in _ONLY_IN_BRACKETS:
+            return None
     return word if word in UNITS[role] and word != name else None
+
+
+def _foreign_unit(name: str) -> str:
+    """Return the word in brackets after a name, except for an index, '' without one."""
+    match = _BRACKETS.match(name)
+    word = match[2].strip() if match else ''
+    return '' if re.fullmatch(r'[\d\s,:.-]*', word) else word
 
 
 def with_unit(role: str, name: str, values: FloatArray) -> str:
@@ -232,7 +269,7 @@ def with_unit(role: str, name: str, values: FloatArray) -> str:
 
 def column_values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
     """Return the values (n,) of a column in SI units, by its name with sign, factor and unit."""
-    if role == 'time' and ':' in spec:
+    if role == 'time' and ':' in spec and spec not in table.columns:
         seconds, _, nanoseconds = spec.partition(':')
         both = [_column(table, role, name)[1] for name in (seconds, nanoseconds)]
         # Relative to the start: the sum may exceed the precision of a float.
@@ -248,6 +285,11 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
         name, factor, unit = match.groups()
     name, column = _column(table, role, name)
     unit = unit or unit_of(name, role)
+    if unit is None and (foreign := _foreign_unit(name)):
+        raise RecordingError(
+            f'{table.path}: the unit {foreign!r} of the column {name!r} is not one of '
+            f"{', '.join(UNITS[role])} for {role}: use --columns '{role}={name}[UNIT]'"
+        )
     if unit is not None and unit not in UNITS[role]:
         raise RecordingError(
             f'--columns {role}={spec}: the unit must be one of {", ".join(UNITS[role])}, '

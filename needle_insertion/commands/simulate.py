@@ -43,6 +43,7 @@ _COLUMNS = ('guide_x', 'guide_z', 'tilt_x', 'tilt_z', 'roll')
 _Motion: TypeAlias = dict[str, dynamics.FloatArray]  #: positions by the name of a column
 
 _MOST = 1_000_000  #: most samples of a run
+_SLOWEST: Final = 1e-6  #: least speed of a steered needle: its tissue relaxes in real time [m/s]
 
 _MODES: Final = 'modes'  #: Options of a single model.
 _ONLY: Final = {
@@ -202,8 +203,8 @@ def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
     needle, steering, _ = dynamics.find_needle(needle_name).changed(changes)
     to = _TO if options.to is None else options.to
     speed = _SPEED if options.speed is None else options.speed
-    if not 0.0 < speed < inf:
-        raise ParameterError(f'--speed must be positive and finite, got {speed!r} m/s')
+    if not _SLOWEST <= speed < inf:
+        raise ParameterError(f'--speed must be finite and >= {_SLOWEST:g} m/s, got {speed!r} m/s')
     interval = _STEP / speed if options.interval is None else options.interval
     start = 0.0 if options.depth is None else options.depth
     if start > needle.length:

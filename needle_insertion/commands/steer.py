@@ -11,6 +11,7 @@ from typing import Any, Final
 from needle_controller import OutOfReachError, SIMULATION_LIMITS, SteeringModel, SteeringPrior
 from needle_controller.steering import simulation
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, STEERING_LAWS
+from needle_controller.steering.planner import check_steps
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
 import needle_dynamics as dynamics
 from needle_dynamics.needles import DIAMETERS, NeedlePreset
@@ -136,6 +137,7 @@ def sample_needle(
 def run(options: argparse.Namespace) -> int:
     nominal = dynamics.find_needle(options.needle)
     target = _target(options, nominal)
+    check_steps(round(min(target[1] / options.step, 1e9)), options.step, '--step')
     aim, depths = target[[0, 2]], simulation.step_depths(target[1], options.step)
     changes = common.constants(options.set)
     check_names('', changes, (*CONSTANTS, *DIAMETERS))

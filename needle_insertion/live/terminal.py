@@ -190,7 +190,7 @@ class Terminal(Cmd):
         from difflib import get_close_matches
 
         near = get_close_matches(word, WORDS, 1)
-        meant = f'; did you mean {near[0]}?' if near else ''
+        meant = f'; did you mean {near[0]}?' if near else '.'
         raise ParameterError(f'unknown word {word!r}{meant} Valid are {", ".join(WORDS)}')
 
     def _spin_until(self, condition: Callable[[], Any], what: str, timeout: float) -> None:

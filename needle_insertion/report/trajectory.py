@@ -33,7 +33,7 @@ def summary(trajectory: Trajectory) -> dict[str, float]:
     compared = np.isfinite(trajectory.error)
     return {
         'duration [s]': float(trajectory.time[-1]),
-        **({'hub at the skin after [s]': float(at_hub[0])} if at_hub.size else {}),
+        **({'hub at the skin at the latest after [s]': float(at_hub[0])} if at_hub.size else {}),
         'insertion depth at the end [m]': float(trajectory.depth[-1]),
         'insertion velocity at the end [m/s]': float(-states[-1, model.coordinates]),
         'largest tip deflection [m]': float(np.abs(tips).max()),

@@ -117,7 +117,7 @@ def test_limits_of_model_and_sampling_are_warned_of(capsys: pytest.CaptureFixtur
 
 def test_hub_contact_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     """Only if the needle is inserted up to the hub."""
-    name = 'hub at the skin after [s]'
+    name = 'hub at the skin at the latest after [s]'
     for preset, time in (('paper_si', 0.0287), ('phantom', 22.13)):
         assert main(['simulate', '--json', '--needle', preset]) == 0
         said = capsys.readouterr()

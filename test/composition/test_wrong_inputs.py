@@ -20,6 +20,7 @@ ANSWERS = {
     'steer --target 4,100,-2': 'in (0, 160] mm with the needle bending_35mm, got 100000 mm; '
     'lengths without a unit are in m',
     'steer --target 4mm,100mm': 'x,y,z, where y is the depth, such as 4mm,100mm,-2mm',
+    'steer --step 1e-6': 'it would take 100000 steps of 0.001 mm, at most 200 are possible',
     'steer --target 4mm,300mm,0mm': 'the depth must be in (0, 160] mm',
     'steer --target 4in,100mm,0mm': "'4in' is not a length, such as 0.05 or 50mm",
     'steer --target 40mm,100mm,0mm': 'out of reach: reachable are x = 0.00 ± ',
@@ -58,7 +59,7 @@ ANSWERS = {
     'identify friction notes.pdf': 'notes.pdf is not a recording; valid: ',
     'identify friction table.csv': 'must last > 0.048 s',
     'identify friction table.csv --columns force=g': "no column 'g' for force; it has t, q, f",
-    'identify friction table.csv --columns time=t[N]': 'must be one of s, sec, ms, us, µs, ns',
+    'identify friction table.csv --columns time=t[N]': 'must be one of s, sec, ms, us, µs, μs, ns',
     'identify friction BAG --wrench-topic wrench': 'it has /base_wrench (geometry_msgs',
     'identify friction BAG --force-axis w': 'force axis must be x, y, z, -x, -y or -z',
     'identify friction BAG --motion-axis slide': 'must name one of insertion, rotation',

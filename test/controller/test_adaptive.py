@@ -12,13 +12,16 @@ from needle_controller import (
     AdaptiveGains,
     Axis,
     Controller,
+    ControllerSettings,
     InverseDynamics,
     InverseDynamicsGains,
     Measurement,
     MinimumJerk,
     ReferenceLimits,
     run_batch,
+    run_controller,
     Setpoint,
+    Uncertainty,
 )
 from needle_controller.compiled.laws import bounds, correction, LEARNED, MEASURED
 from needle_controller.laws.law import SampledLoop
@@ -167,6 +170,25 @@ def test_adaptive_law_tracks_better_than_inverse_dynamics(delay: int) -> None:
     )
     assert (learned.rms < 0.9 * fixed.rms).all()
     assert np.abs(learned.final).max() < 1e-5
+
+
+def test_learning_is_bumpless() -> None:
+    """A light needle with more friction than modeled does not lunge when it breaks away."""
+    nominal = NeedleParameters(
+        length=0.2, carriage_mass=0.042, coulomb_friction=16.9, viscous_friction=1.02, modes=1
+    )
+    steering = Controller(
+        nominal,
+        settings=ControllerSettings(force_limit=43.8),
+        uncertainty=Uncertainty(carriage=0.0),
+    )
+    steering.set_target(0.1266)
+    plant = replace(nominal, coulomb_friction=1.22 * 16.9)
+    start = NeedleModel(plant).state_at(0.1)
+    run = run_controller(steering, plant, start, duration=6.0, step=1e-3)
+    # Added to the integral, which has compensated it, the learned friction led to 11.5 mm.
+    assert run.depth.max() < 0.1266 + 2e-4
+    assert abs(run.depth[-1] - 0.1266) < 2e-4
 
 
 def test_controller_reports_learned_friction() -> None:

@@ -316,6 +316,20 @@ def test_inconsistent_measurement_gives_zero_force(depth: float, speed: float, f
     assert steering.target == 0.05
 
 
+def test_load_that_is_not_finite_is_a_fault() -> None:
+    """Zero force for one sample; the law does not remember it."""
+    steering = controller()
+    steering.set_target(0.05)
+    forces = []
+    for i in range(100):
+        measured = Measurement(time=i * PERIOD, depth=0.02, velocity=0.0)
+        command = steering.command(measured, load=nan if i == 50 else 0.0)
+        assert (command.fault is not None) == (i == 50)
+        forces.append(command.force)
+    assert forces[50] == 0.0
+    assert 0.0 < forces[-1] < 15.0
+
+
 @pytest.mark.requirement('S-072')
 def test_needle_moved_during_a_fault_clears_the_target() -> None:
     """One message, and no motion before a new target."""

@@ -330,10 +330,17 @@ def test_batch_noise_is_encoder_noise() -> None:
     pushed = run_batch(law, NOMINAL, START, REFERENCE, noise=noise + beside, **options)
     plain = run_batch(law, NOMINAL, START, REFERENCE, noise=noise, **options)
     assert (pushed.commands < plain.commands).mean() > 0.9
-    with pytest.raises(ShapeError, match=r'noise must be finite, of shape \(\d+, 3\)'):
-        run_batch(law, NOMINAL, START, REFERENCE, noise=noise[1:], **options)
     with pytest.raises(ParameterError, match='delay and late >= 0'):
         run_batch(law, NOMINAL, START, REFERENCE, late=-1, **options)
+    for wrong in (noise[1:], noise.T, noise.ravel(), np.nan * noise, ['a']):
+        with pytest.raises(ShapeError, match='noise must be'):
+            run_batch(law, NOMINAL, START, REFERENCE, noise=wrong, **options)
+    for added in ([[0.01, -1.0, 0.0]], [[0.02, 1.0, 0.0], [0.01, 1.0, 0.0]]):
+        with pytest.raises(ParameterError, match='added must have increasing depths'):
+            run_batch(law, NOMINAL, START, REFERENCE, added=added, **options)
+    for limit in (-15.0, np.nan):
+        with pytest.raises(ParameterError, match='step and limit > 0'):
+            run_batch(law, NOMINAL, START, REFERENCE, **{**options, 'limit': limit})
 
 
 # Rounding, which the closed loop amplifies; four modes keep five digits, see `LARGEST_CONDITION`.

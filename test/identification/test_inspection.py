@@ -26,6 +26,21 @@ WRENCH, JOINTS, POSE = (
 )
 
 
+def test_table_with_a_moved_guide_is_for_steering(tmp_path: Path) -> None:
+    """Also if it has a force; with a guide at rest it is for friction."""
+    depth = np.linspace(0.0, 0.1, 21)
+    columns = {
+        'time': depth / 0.005, 'depth': depth, 'force': 1.0 + depth, 'guide_x': 0.01 * depth,
+        'guide_z': 0.0 * depth, 'tip_x': 0.02 * depth, 'tip_z': 0.0 * depth,
+    }  # fmt: skip
+    for moves, kind in ((1.0, 'steering'), (0.0, 'friction')):
+        columns['guide_x'] = moves * 0.01 * depth
+        path = tmp_path / f'{kind}.csv'
+        rows = np.column_stack(list(columns.values()))
+        np.savetxt(path, rows, delimiter=',', header=','.join(columns), comments='')
+        assert f'needle identify {kind} ' in inspect_recording(path).command
+
+
 def ros1(path: Path, *, axis: int = 2, sign: float = -1.0) -> Path:
     """Write a ROS 1 recording with a robot of two joints, its pose, and two force sensors."""
     types = ROS1.types

@@ -54,6 +54,44 @@ def written(folder: Path, text: str, name: str = 'run.csv') -> Path:
     return path
 
 
+@pytest.mark.parametrize(
+    ('head', 'unit'),
+    [
+        ('t [s],q [m],F [V]', 'V'),
+        ('t [s],q (deg),F [N]', 'deg'),
+        ('t [ticks],q [m],F [N]', 'ticks'),
+    ],
+)
+def test_unknown_unit_is_rejected(tmp_path: Path, run: Any, head: str, unit: str) -> None:
+    """Its numbers would be taken as SI units; a unit in the option replaces it."""
+    path = written(tmp_path, lines(head, *run))
+    roles = dict(zip(('time', 'depth', 'force'), head.split(','), strict=True))
+    with pytest.raises(RecordingError, match=f"the unit '{unit}' of the column"):
+        read_friction_recording(path, columns=roles)
+    assert f"the unit '{unit}'" in inspect_recording(path).lacking
+    units = {'time': 's', 'depth': 'm', 'force': 'N'}
+    given = {role: f'{name}[{units[role]}]' for role, name in roles.items()}
+    assert_allclose(read_friction_recording(path, columns=given).force, run[2], rtol=1e-8)
+
+
+def test_units_of_inches_and_indices(tmp_path: Path, run: Any) -> None:
+    """Inches are read in brackets; an index in brackets is no unit, an ending no inch."""
+    time, depth, force = run
+    path = written(tmp_path, lines('time [s],depth [in],force [N]', time, depth / 0.0254, force))
+    assert_allclose(read_friction_recording(path).depth, depth, rtol=1e-8)
+    for name in ('position[0]', 'q_in'):
+        path = written(tmp_path, lines(f'time,{name},force', time, depth, force))
+        found = read_friction_recording(path, columns={'depth': name})
+        assert_allclose(found.depth, depth, rtol=1e-8)
+
+
+def test_column_of_time_with_a_colon(tmp_path: Path, run: Any) -> None:
+    """A whole name is no pair of seconds and nanoseconds."""
+    path = written(tmp_path, lines('t:0,q,F', *run))
+    found = read_friction_recording(path, columns={'time': 't:0', 'depth': 'q', 'force': 'F'})
+    assert_allclose(found.time, run[0] - run[0][0], atol=1e-8)
+
+
 FORMS: dict[str, tuple[Callable[..., str], dict[str, str]]] = {
     'usual names': (lambda t, q, f: lines('time,position,force', t, q, f), {}),
     'units in brackets': (

@@ -9,12 +9,16 @@ import subprocess
 import sys
 
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import GetState
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.nodes import NODES
+from needle_ros.base_node import LATCHED
 from needle_ros.status import node_of, STALE
 import pytest
+from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from std_msgs.msg import String
 from support.installed import node_class
 from support.ros_graph import RosGraph
 import yaml
@@ -52,6 +56,45 @@ def test_unchanged_values_may_be_set_while_configured(ros_graph: RosGraph) -> No
     refused = node.set_parameters([Parameter('rate', value=500.0)])[0]
     assert not refused.successful
     assert 'cannot change while configured' in refused.reason
+
+
+def test_other_requests_are_answered_during_a_whole_file(ros_graph: RosGraph) -> None:
+    """As by `ros2 param load`; without a new value, no configuration is published."""
+    node, user = ros_graph.add(ControllerNode), ros_graph.node('user')
+    client = user.create_client(SetParameters, 'controller/set_parameters')
+    states = user.create_client(GetState, 'controller/get_state')
+    found = ros_graph.listen(user, String, 'controller/configuration', LATCHED)
+    ros_graph.spin_until(client.service_is_ready, 'the service')
+    ros_graph.spin_until(states.service_is_ready, 'the service')
+    ros_graph.spin_until(lambda: found, 'the configuration')
+    values = {name: value for name, value in node.values().items() if value != []}
+    del values['needle']
+    same = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    everything = client.call_async(SetParameters.Request(parameters=same))
+    state = states.call_async(GetState.Request())
+    ros_graph.spin_until(state.done, 'the state')
+    assert not everything.done()
+    ros_graph.spin_until(everything.done, 'the parameters')
+    results = everything.result().results
+    assert len(results) == len(same)
+    assert all(one.successful for one in results)
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'reason'),
+    [('axes', [], 'axes must be two'), ('apply_to', ['my-robot/x'], 'must have names of nodes')],
+)
+def test_lists_of_the_node_identification(
+    ros_graph: RosGraph, tmp_path: Path, name: str, value: list[str], reason: str
+) -> None:
+    """An empty list of a file is None in rcl; each error is one line."""
+    file = tmp_path / 'identification.yaml'
+    empty = {'bags': [], 'apply_to': [], name: value}
+    file.write_text(yaml.safe_dump({'identification': {'ros__parameters': empty}}))
+    node = ros_graph.add(node_class('identification'), cli_args=arguments(file), start=False)
+    assert not node.start()
+    assert reason in node.failure
 
 
 def test_numeric_text_is_parsed_as_a_number(ros_graph: RosGraph) -> None:

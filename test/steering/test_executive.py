@@ -12,6 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from needle_controller import ExecutiveSettings, ReferenceLimits, SteeringPrior
 from needle_controller.reference.path import Path
+from needle_controller.reference.quintic import Quintic
+from needle_controller.reference.setpoint import Setpoint
 from needle_controller.steering.guarded_law import TipMeasurements
 from needle_controller.steering.law import NORMAL, TipEstimate
 from needle_controller.steering.motion import duration_of, JointMotion, smooth
@@ -23,6 +25,7 @@ from needle_ros.wire import Reading
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 from support.steered_robot import CONTINUOUS, NAMES, PERIOD, Robot, SECOND, SETTINGS, TARGET
 
 
@@ -47,6 +50,18 @@ def test_motion_is_smooth_proportional_and_monotonic(
     assert_allclose(move.positions, one + np.outer(gone, way), atol=1e-15)
     # The highest speed of a polynomial of least jerk is 15/8 of the mean.
     assert (np.abs(move.velocities) <= 1.8751 * np.abs(way) / duration + 1e-15).all()
+
+
+@given(duration=st.floats(100.0, 1e10))
+def test_long_motion_has_few_points(duration: float) -> None:
+    """As for a speed of 1e-9 m/s; cubics between the points are exact to 1e-9 of the way."""
+    move = smooth(NAMES, np.zeros(3), np.array([0.1, 0.0, 0.0]), duration)
+    assert len(move.times) <= 1000
+    spline = CubicHermiteSpline(move.times, move.positions[:, 0], move.velocities[:, 0])
+    way = Quintic(Setpoint(0.0), Setpoint(0.1), duration)
+    times = np.linspace(move.times[0], duration, 4001)
+    expected = [way.at(time).position for time in times.tolist()]
+    assert_allclose(spline(times), expected, atol=1e-10)
 
 
 @pytest.mark.requirement('S-117')
