@@ -18,7 +18,7 @@ def write_whole(path: Path | str, content: bytes) -> None:
     """Write a file atomically: a reader sees the old or the new content, never a part."""
     # The target of a link is written, and not replaced by another file.
     path = Path(os.path.realpath(path)) if Path(path).is_symlink() else Path(path)
-    if not path.name or (path.exists() and not path.is_file()):
+    if not path.name or path.is_dir() or path.is_char_device() or path.is_block_device():
         raise ParameterError(f'{path} cannot be written: it is not the name of a file')
     draft = path.with_name(f'{path.name}.{os.getpid()}.tmp')
     try:

@@ -204,7 +204,11 @@ class ParameterNode(LifecycleNode):
     def _changes(self, parameters: list[Parameter]) -> dict[str, Any]:
         """Return the new values; others are accepted: a whole file can be loaded again."""
         given = {one.name: self._meant(one.name, one.value) for one in parameters}
-        return {name: new for name, new in given.items() if not _same(new, self.value(name))}
+        return {
+            name: new
+            for name, new in given.items()
+            if name not in self._parameters or not _same(new, self.value(name))
+        }
 
     def _check_change(self, parameters: list[Parameter]) -> SetParametersResult:
         if not self._configured:

@@ -13,7 +13,6 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from itertools import islice
-from math import pi
 import os
 from pathlib import Path
 import re
@@ -27,6 +26,13 @@ from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
 from needle_identification.recordings.samples import are_gaps, Series
+from needle_identification.recordings.units import (
+    BRACKETS,
+    foreign_unit,
+    ONLY_IN_BRACKETS,
+    unit_of,
+    UNITS,
+)
 from needle_ros.errors import shown
 from needle_ros.quantities import signed
 import numpy as np
@@ -34,45 +40,6 @@ import numpy as np
 #: Suffixes of table files.
 MATLAB: Final = '.mat'
 TABLES: Final = ('.csv', '.tsv', '.txt', '.dat', MATLAB)
-
-_INCH: Final = 0.0254  #: [m]
-_MICRO: Final = (
-    'u',
-    'µ',
-    '\u03bc',
-)  #: The letter of 1e-6: also the micro sign and the Greek letter.
-_LENGTHS: Final = {
-    'm': 1.0,
-    'mm': 1e-3,
-    'cm': 1e-2,
-    'in': _INCH,
-    'inch': _INCH,
-    **{f'{micro}m': 1e-6 for micro in _MICRO},
-}
-_ANGLES: Final = {'rad': 1.0, 'deg': pi / 180.0}
-
-#: Units by role, in SI units.
-UNITS: Final[Mapping[str, Mapping[str, float]]] = {
-    'time': {
-        's': 1.0,
-        'sec': 1.0,
-        'ms': 1e-3,
-        **{f'{micro}s': 1e-6 for micro in _MICRO},
-        'ns': 1e-9,
-        'min': 60.0,
-        'h': 3600.0,
-    },
-    'depth': _LENGTHS,
-    'speed': {
-        **{f'{length}/s': size for length, size in _LENGTHS.items()},
-        **{f'{length}/min': size / 60.0 for length, size in _LENGTHS.items()},
-    },
-    'force': {'N': 1.0, 'mN': 1e-3, 'kN': 1e3, 'kgf': 9.80665, 'gf': 9.80665e-3, 'lbf': 4.4482216},
-    **dict.fromkeys(('guide_x', 'guide_z', 'tip_x', 'tip_y', 'tip_z'), _LENGTHS),
-    **dict.fromkeys(('roll', 'tilt_x', 'tilt_z'), _ANGLES),
-}
-
-_ONLY_IN_BRACKETS: Final = ('in', 'h')  #: Units that are usual endings of names.
 
 ROLES: Final = ('time', 'depth', 'speed', 'force')  #: for friction; depth or speed is sufficient
 
@@ -102,7 +69,6 @@ _SUSPICIOUS: Final = {
 }
 _SECONDS: Final = ('sec', 'seconds')  #: Names of times that are in s.
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
-_BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
 _SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
 
 
@@ -232,29 +198,12 @@ def guessed(
 
 def plain_name(name: str) -> str:
     """Return a name without its unit, case and signs."""
-    if match := _BRACKETS.match(name):
+    if match := BRACKETS.match(name):
         name = match[1]
     front, _, last = name.rpartition('_')
-    if front and last not in _ONLY_IN_BRACKETS and any(last in one for one in UNITS.values()):
+    if front and last not in ONLY_IN_BRACKETS and any(last in one for one in UNITS.values()):
         name = front
     return _WORD.sub('', name.lower())
-
-
-def unit_of(name: str, role: str) -> str | None:
-    if match := _BRACKETS.match(name):
-        word = match[2].strip()
-    else:
-        _, _, word = name.rpartition('_')
-        if word in _ONLY_IN_BRACKETS:
-            return None
-    return word if word in UNITS[role] and word != name else None
-
-
-def _foreign_unit(name: str) -> str:
-    """Return the word in brackets after a name, except for an index, '' without one."""
-    match = _BRACKETS.match(name)
-    word = match[2].strip() if match else ''
-    return '' if re.fullmatch(r'[\d\s,:.-]*', word) else word
 
 
 def with_unit(role: str, name: str, values: FloatArray) -> str:
@@ -285,7 +234,7 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
         name, factor, unit = match.groups()
     name, column = _column(table, role, name)
     unit = unit or unit_of(name, role)
-    if unit is None and (foreign := _foreign_unit(name)):
+    if unit is None and (foreign := foreign_unit(name)):
         raise RecordingError(
             f'{table.path}: the unit {foreign!r} of the column {name!r} is not one of '
             f"{', '.join(UNITS[role])} for {role}: use --columns '{role}={name}[UNIT]'"
@@ -307,7 +256,7 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
 def _column(table: Table, role: str, name: str) -> tuple[str, FloatArray]:
     """Return the full name and the values of a column, given by name (unit optional) or number."""
     names = list(table.columns)
-    same = [other for other in names if _BRACKETS.sub(r'\1', other) == name]
+    same = [other for other in names if BRACKETS.sub(r'\1', other) == name]
     if name not in names and len(same) == 1:
         name = same[0]
     elif name not in names and name.isdecimal() and 0 < int(name) <= len(names):

@@ -27,6 +27,7 @@ from needle_identification.recordings import reading, tables
 from needle_identification.recordings.reading import merge
 from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import Table
+from needle_identification.recordings.units import unit_of, UNITS
 from needle_identification.steering.recording import recorded_insertion, SteeringRecording
 from needle_ros import contract, wire
 from needle_ros.quantities import signed, signed_axis
@@ -201,7 +202,7 @@ def steering_columns(table: Table, given: Mapping[str, str] | None = None) -> di
     units = _units(table, specs, given)
     depth = _measured(table.columns[specs['depth']])
     for role, unit in units.items():
-        if tables.unit_of(specs[role], role) is None and unit:
+        if unit_of(specs[role], role) is None and unit:
             specs[role] = f'{specs[role]}[{unit}]'
     if is_inverted(depth):
         specs['depth'] = f'-{specs["depth"]}'
@@ -217,7 +218,7 @@ def is_inverted(depth: FloatArray) -> bool:
 def check_depth(table: Table, spec: str) -> None:
     """Raise a RecordingError if the unit of a depth that was found is not known."""
     name = spec.lstrip('-')
-    if name not in table.columns or tables.unit_of(name, 'depth') is not None:
+    if name not in table.columns or unit_of(name, 'depth') is not None:
         return
     if (span := float(np.ptp(_measured(table.columns[name])))) > _LARGE:
         raise RecordingError(
@@ -228,7 +229,7 @@ def check_depth(table: Table, spec: str) -> None:
 
 def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
     """Return the unit of each role, '' if unknown or in SI units."""
-    stated = {role: tables.unit_of(given.get(role, name), role) for role, name in specs.items()}
+    stated = {role: unit_of(given.get(role, name), role) for role, name in specs.items()}
     moved = {role: _measured(table.columns[name]) for role, name in specs.items()}
     bodies = {
         role: re.sub(r'^[xyz]|[xyz123]$', '', tables.plain_name(name))
@@ -243,7 +244,7 @@ def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> 
         if not known and any(bodies[role] == bodies['depth'] for role in roles):
             known = {found['depth']}
         if not known and 'tip_x' in group and deep is not None:
-            known = _along(table, span * tables.UNITS['depth'][deep or 'm'])
+            known = _along(table, span * UNITS['depth'][deep or 'm'])
         if not known:
             large = any(
                 np.ptp(moved[role]) > _LATERAL or np.abs(moved[role]).max() > _FAR
@@ -265,7 +266,7 @@ def _along(table: Table, depth: float) -> set[str]:
         return set()
     span = float(np.ptp(_measured(table.columns[names['along']])))
     for unit in ('m', 'cm', 'mm'):
-        if _ALONG < span * tables.UNITS['depth'][unit] / depth < 1.0 / _ALONG:
+        if _ALONG < span * UNITS['depth'][unit] / depth < 1.0 / _ALONG:
             return {'' if unit == 'm' else unit}
     return set()
 

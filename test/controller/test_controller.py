@@ -395,12 +395,14 @@ def test_gap_or_step_back_in_time_restarts_the_motion(step: float) -> None:
 @pytest.mark.requirement('S-087')
 @pytest.mark.parametrize('load', [nan, inf])
 def test_command_detects_non_finite_values(load: float) -> None:
-    """An invalid load gives a command that must not be sent."""
+    """An invalid load gives no force; an invalid command must not be sent."""
     steering = controller()
     steering.set_target(0.05)
     measured = Measurement(time=0.0, depth=0.02, velocity=0.0)
     assert steering.command(measured).is_finite()
-    assert not steering.command(measured, nan).is_finite()
+    refused = steering.command(measured, load)
+    assert refused.force == 0.0
+    assert 'must be finite' in refused.fault
     assert not ControllerOutput(force=0.0, torque=load, setpoint=Setpoint(0.02)).is_finite()
 
 

@@ -461,5 +461,5 @@ def test_friction_change_during_a_run_equals_another_needle() -> None:
     same = plain < 0.025
     assert_allclose(later[same], plain[same], rtol=0.0, atol=1e-15)
     assert np.abs(later - plain).max() > 1e-5
-    with pytest.raises(ParameterError, match='added must be finite, with increasing lengths'):
+    with pytest.raises(ParameterError, match='added must have increasing depths'):
         run(needle, [(0.025, *added), (0.02, *added)])

@@ -26,7 +26,7 @@ SOURCES = {
 DECLARED = {'low', 'valid', 'type'}
 #: Methods of a node that declare a parameter, and that read one.
 DECLARE_ROS = ('declare_text', 'declare_parameter')
-READ_ROS = ('text', 'get_parameter', 'get')
+READ_ROS = ('text', 'get_parameter', 'get', 'value')
 
 
 def settings_classes() -> list[type]:

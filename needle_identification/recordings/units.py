@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units of table columns by role, and units in their names."""
+
+from collections.abc import Mapping
+from math import pi
+import re
+from typing import Final
+
+_INCH: Final = 0.0254  #: [m]
+_MICRO: Final = ('u', 'µ', '\u03bc')  #: Prefixes of 1e-6: letter u, micro sign, Greek letter.
+_LENGTHS: Final = {
+    'm': 1.0,
+    'mm': 1e-3,
+    'cm': 1e-2,
+    'in': _INCH,
+    'inch': _INCH,
+    **{f'{micro}m': 1e-6 for micro in _MICRO},
+}
+_ANGLES: Final = {'rad': 1.0, 'deg': pi / 180.0}
+
+#: Units by role, in SI units.
+UNITS: Final[Mapping[str, Mapping[str, float]]] = {
+    'time': {
+        's': 1.0,
+        'sec': 1.0,
+        'ms': 1e-3,
+        **{f'{micro}s': 1e-6 for micro in _MICRO},
+        'ns': 1e-9,
+        'min': 60.0,
+        'h': 3600.0,
+    },
+    'depth': _LENGTHS,
+    'speed': {
+        **{f'{length}/s': size for length, size in _LENGTHS.items()},
+        **{f'{length}/min': size / 60.0 for length, size in _LENGTHS.items()},
+    },
+    'force': {'N': 1.0, 'mN': 1e-3, 'kN': 1e3, 'kgf': 9.80665, 'gf': 9.80665e-3, 'lbf': 4.4482216},
+    **dict.fromkeys(('guide_x', 'guide_z', 'tip_x', 'tip_y', 'tip_z'), _LENGTHS),
+    **dict.fromkeys(('roll', 'tilt_x', 'tilt_z'), _ANGLES),
+}
+
+ONLY_IN_BRACKETS: Final = ('in', 'h')  #: Units that are usual endings of names.
+
+#: A name with a word in brackets after it.
+BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
+
+
+def unit_of(name: str, role: str) -> str | None:
+    if match := BRACKETS.match(name):
+        word = match[2].strip()
+    else:
+        _, _, word = name.rpartition('_')
+        if word in ONLY_IN_BRACKETS:
+            return None
+    return word if word in UNITS[role] and word != name else None
+
+
+def foreign_unit(name: str) -> str:
+    """Return the word in brackets after a name, except for an index, '' without one."""
+    match = BRACKETS.match(name)
+    word = match[2].strip() if match else ''
+    return '' if re.fullmatch(r'[\d\s,:.-]*', word) else word
