@@ -42,16 +42,16 @@ LAWS: Final = tuple(DEFAULT_GAINS)  #: Control laws by name, the default first.
 
 def completed(gains: AllGains, defaults: AllGains = DEFAULT_GAINS) -> dict[str, dict[str, Gains]]:
     """Return gains of every law and axis; reject unknown names and gains of another law."""
-    completed = {law: dict(axes) for law, axes in defaults.items()}
+    found = {law: dict(axes) for law, axes in defaults.items()}
     for law, axes in gains.items():
         for axis, chosen in axes.items():
-            if law not in completed or axis not in completed[law]:
+            if law not in found or axis not in found[law]:
                 raise ParameterError(
                     f'unknown gains {law}.{axis}; valid: {", ".join(LAWS)} with '
                     f'{" and ".join(AXES)}'
                 )
-            kind = type(completed[law][axis])
+            kind = type(found[law][axis])
             if not isinstance(chosen, kind):
                 raise ParameterError(f'{law}.{axis} must be {kind.__name__}, got {chosen!r}')
-            completed[law][axis] = chosen
-    return completed
+            found[law][axis] = chosen
+    return found

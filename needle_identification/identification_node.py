@@ -37,6 +37,7 @@ from needle_ros.event_log import Severity
 from needle_ros.quantities import AXES, signed, signed_axis
 from needle_ros.requests import no_answer
 from needle_ros.run_node import run
+from needle_ros.services_node import answer_later
 from needle_ros.settings import CheckedSettings, constant, positive
 from needle_ros.status import Diagnosis, IdentificationStatus
 from needle_ros.wire import Reading
@@ -45,7 +46,6 @@ from rclpy.client import Client
 from rclpy.exceptions import InvalidServiceNameException
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.service import Service
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -156,7 +156,7 @@ class IdentificationNode(BaseNode):
         self._friction = self.publisher(contract.FRICTION, always=True)
         self._stiffness = self.publisher(contract.STIFFNESS, always=True)
         self.create_service(Trigger, '~/identify', self._on_identify)
-        _answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
+        answer_later(self.create_service(Trigger, '~/apply', self._on_apply))
 
     def _setter(self, name: str) -> Client:
         try:
@@ -353,20 +353,6 @@ class IdentificationNode(BaseNode):
             answer.add_done_callback(answer_all)
         answer_all()
         return later
-
-
-def _answer_later(service: Service) -> None:
-    """Let the callback of a service return a future of its response."""
-    # The events executor of rclpy accepts no coroutines as callbacks, and sends the value.
-    send = service.send_response
-
-    def send_later(response: Any, header: Any) -> None:
-        if isinstance(response, Future):
-            response.add_done_callback(lambda done: send(done.result(), header))
-        else:
-            send(response, header)
-
-    service.send_response = send_later  # type: ignore[method-assign]
 
 
 def _summary_statuses(

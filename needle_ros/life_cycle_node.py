@@ -5,12 +5,13 @@ from collections.abc import Callable, Iterable, Iterator
 import gc
 from importlib import import_module
 from threading import Thread
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from needle_ros.services_node import DeferredService
+from needle_ros.services_node import answer_later
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.task import Future
 
 
 class PreparationProgress(NamedTuple):
@@ -100,8 +101,11 @@ class LifeCycle:
     ) -> None:
         self._node, self._preparation, self._is_valid = node, preparation, is_valid
         self._waiting: Callable[[], object] | None = None  #: Called after the preparation.
-        self._later: ChangeState.Response | None = None  #: Deferred response.
-        self._service = DeferredService(node._service_change_state, self._on_request)
+        #: Deferred response, and its future.
+        self._later: tuple[ChangeState.Response, Future] | None = None
+        service: Any = node._service_change_state
+        service.callback = self._on_request
+        answer_later(service)
 
     def when_prepared(self, act: Callable[[], object]) -> None:
         """Call `act` after the preparation: immediately if complete, else from the executor."""
@@ -125,7 +129,9 @@ class LifeCycle:
         if act is not None:
             act()
 
-    def _on_request(self, request: ChangeState.Request, response: ChangeState.Response) -> bool:
+    def _on_request(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response | Future:
         machine, log = self._node._state_machine, self._node.get_logger()
         valid = {label: number for number, label, *_ in machine.available_transitions}
         asked = request.transition
@@ -140,19 +146,21 @@ class LifeCycle:
         elif self._waiting is not None:
             log.error(f'configure is under way: {self._preparation.progress}')
         else:
-            self._later = response
+            later = Future()
+            self._later = response, later
             self.when_prepared(self._configure)
-            return self._later is None
-        return True
+            return later
+        return response
 
     def _configure(self) -> None:
-        response, self._later = self._later, None
-        if response is None:
+        deferred, self._later = self._later, None
+        if deferred is None:
             return
+        response, later = deferred
         # The node may have been shut down meanwhile.
         if self._node._state_machine.current_state[1] == 'unconfigured':
             response.success = self._trigger(_CONFIGURE)
-        self._service.send(response)
+        later.set_result(response)
 
     def _trigger(self, transition: int) -> bool:
         done = _TRIGGERS[transition](self._node)

@@ -13,41 +13,28 @@ from needle_ros.process import leave_realtime
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 
 
-class DeferredService:
-    """
-    Service whose responses may be sent after the callback; EventsExecutor awaits no coroutine.
+def answer_later(service: Any) -> None:
+    """Let the callback of a service return a future of its response."""
+    # The events executor of rclpy accepts no coroutines as callbacks, and sends the value.
+    send = service.send_response
 
-    ``take`` receives a request and its response, and returns whether the response is complete.
-    Otherwise `send` sends it later; within ``take`` it does nothing.
-    """
-
-    def __init__(self, service: Any, take: Callable[[Any, Any], bool]) -> None:
-        self._take, self._send = take, service.send_response
-        self._headers: dict[int, Any] = {}  #: Header of the request, by response.
-        service.callback, service.send_response = self._on_request, self._on_response
-
-    def _on_request(self, request: Any, response: Any) -> Any:
-        if not self._take(request, response):
-            self._headers[id(response)] = None
-        return response
-
-    def _on_response(self, response: Any, header: Any) -> None:
-        if id(response) in self._headers:
-            self._headers[id(response)] = header
+    def send_later(response: Any, header: Any) -> None:
+        if isinstance(response, Future):
+            response.add_done_callback(lambda done: send(done.result(), header))
         else:
-            self._send(response, header)
+            send(response, header)
 
-    def send(self, response: Any) -> None:
-        if (header := self._headers.pop(id(response), None)) is not None:
-            self._send(response, header)
+    service.send_response = send_later
 
 
 class _Change(NamedTuple):
     #: Its long checks; None where other callbacks may be executed.
     steps: Iterator[Callable[[], object] | None]
-    send: Callable[[], None]
+    response: Any
+    later: Future  #: of the response
 
 
 class ParameterServices:
@@ -61,23 +48,33 @@ class ParameterServices:
         self._node = node
         self._changes: deque[_Change] = deque()
         for service in node.services:
-            if service.srv_type in (SetParameters, SetParametersAtomically):
-                self._serve(service)
-
-    def _serve(self, service: Any) -> None:
-
-        parameter: Any = Parameter
-
-        def take(request: Any, response: Any) -> bool:
-            given = [parameter.from_parameter_msg(one) for one in request.parameters]
             if service.srv_type is SetParameters:
-                steps = self._steps([[one] for one in given], response.results.append)
+                service.callback = self._set_each
+            elif service.srv_type is SetParametersAtomically:
+                service.callback = self._set_together
             else:
-                steps = self._steps([given], partial(setattr, response, 'result'))
-            self._changes.append(_Change(steps, partial(deferred.send, response)))
-            return len(self._changes) == 1 and self._continue()
+                continue
+            answer_later(service)
 
-        deferred = DeferredService(service, take)
+    def _set_each(self, request: Any, response: Any) -> Future:
+        groups = [[Parameter.from_parameter_msg(one)] for one in request.parameters]
+        return self._set(groups, response.results.append, response)
+
+    def _set_together(self, request: Any, response: Any) -> Future:
+        group = [Parameter.from_parameter_msg(one) for one in request.parameters]
+        return self._set([group], partial(setattr, response, 'result'), response)
+
+    def _set(
+        self,
+        groups: list[list[Parameter]],
+        keep: Callable[[SetParametersResult], None],
+        response: Any,
+    ) -> Future:
+        change = _Change(self._steps(groups, keep), response, Future())
+        self._changes.append(change)
+        if len(self._changes) == 1:
+            self._continue()
+        return change.later
 
     def _steps(
         self, groups: list[list[Parameter]], keep: Callable[[SetParametersResult], None]
@@ -90,16 +87,18 @@ class ParameterServices:
                 yield check
             keep(self._node.set_parameters_atomically(group))
 
-    def _continue(self) -> bool:
-        """Continue the oldest change; return whether it is complete, or continued later."""
-        for check in self._changes[0].steps:
-            if check is None:
-                self._continue_later()
-            else:
-                Thread(target=self._run, args=(check,), name='check', daemon=True).start()
-            return False
-        self._changes.popleft()
-        return True
+    def _continue(self) -> None:
+        """Make the changes until a thread checks one, or other callbacks come first."""
+        while self._changes:
+            change = self._changes[0]
+            for check in change.steps:
+                if check is None:
+                    self._continue_later()
+                else:
+                    Thread(target=self._run, args=(check,), name='check', daemon=True).start()
+                return
+            self._changes.popleft()
+            change.later.set_result(change.response)
 
     def _run(self, check: Callable[[], object]) -> None:
         leave_realtime()
@@ -110,11 +109,4 @@ class ParameterServices:
 
     def _continue_later(self) -> None:
         if (executor := self._node.executor) is not None:
-            executor.create_task(self._resume)
-
-    def _resume(self) -> None:
-        while self._changes:
-            change = self._changes[0]
-            if not self._continue():
-                return
-            change.send()
+            executor.create_task(self._continue)

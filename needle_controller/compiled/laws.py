@@ -281,9 +281,10 @@ def adapt(
         c.period,
     )
     if memory[FOLLOWS] == 1.0 and c.ki > 0.0:
-        # The integral has compensated what is learned now: their sum does not change.
+        # The integral has compensated this friction: the sum of both does not change.
         more = _learned(c, memory, memory[POSITION], memory[VELOCITY]) - known
-        memory[INTEGRAL] -= more * _divisor(c, c.pf, c.vf) / c.ki
+        pf, vf = (c.pf, c.vf) if memory[VELOCITY] > 0.0 else (c.back_pf, c.back_vf)
+        memory[INTEGRAL] -= more * _divisor(c, pf, vf) / c.ki
 
 
 @inlined

@@ -2,8 +2,9 @@
 """Read messages of MCAP files chunk by chunk, also of truncated or damaged files."""
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from io import BytesIO
 from itertools import repeat
 from pathlib import Path
@@ -52,6 +53,7 @@ class _Channels:
         self.topics: dict[int, BagTopic] = {}
         self.counts: dict[int, int] = {}
         self._schemas = {0: Schema(id=0, data=b'', encoding='', name='no type')}
+        self._recovered = False
 
     def define(self, opcode: int, record: bytes) -> None:
         stream = ReadDataStream(BytesIO(record))
@@ -68,11 +70,12 @@ class _Channels:
         elif opcode == Opcode.STATISTICS:
             self.counts = Statistics.read(stream).channel_message_counts
 
-    def recover(self, file: Path) -> bytes:
-        """Define the topics after the loss of a chunk, which may have contained them."""
-        with suppress(*DAMAGED_MCAP):
-            self.define_by_index(file)
-        return b''
+    def recover(self, file: Path) -> None:
+        """Define the topics after the loss of the first chunk, which may have contained them."""
+        if not self._recovered:
+            self._recovered = True
+            with suppress(*DAMAGED_MCAP):
+                self.define_by_index(file)
 
     def define_by_index(self, file: Path) -> None:
         """Define all topics of the index at the end of a file, if it has a valid one."""
@@ -134,7 +137,7 @@ def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
                     yield from _batches(bytes(loose), channels, tally)
                     loose.clear()
                 if opcode == Opcode.CHUNK:
-                    content = _chunk_content(body, length, tally) or channels.recover(file)
+                    content = _chunk_content(body, length, tally, partial(channels.recover, file))
                     yield from _batches(content, channels, tally)
             else:
                 tally.budget.spend(0, compression.COSTLY)
@@ -157,8 +160,8 @@ def _skip(stream: Any, length: int) -> None:
         length -= len(part)
 
 
-def _chunk_content(chunk: bytes, length: int, tally: Tally) -> bytes:
-    """Return the records of a chunk: all available if truncated, none if damaged."""
+def _chunk_content(chunk: bytes, length: int, tally: Tally, recover: Callable[[], None]) -> bytes:
+    """Return the records of a chunk: all available if truncated, none if damaged (`recover`)."""
     try:
         _, _, size, checksum, name_length = _CHUNK.unpack_from(chunk)
         begin = _CHUNK.size + name_length + 8
@@ -173,6 +176,7 @@ def _chunk_content(chunk: bytes, length: int, tally: Tally) -> bytes:
                 raise ValueError('the checksum of a chunk is wrong')
     except DAMAGED_MCAP as error:
         tally.faults.append(f'is damaged: {error}')
+        recover()
         return b''
     return data
 

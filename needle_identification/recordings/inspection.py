@@ -20,6 +20,7 @@ from needle_identification.steering.reading import (
     check_depth,
     is_inverted,
     JOINTS,
+    measured_values,
     read_steering_recording,
     steering_columns,
     STEERING_ROLES,
@@ -100,13 +101,13 @@ def inspect_recording(path: Path | str) -> Inspection:
 
 
 def _guide_moves(table: tables.Table, steered: Mapping[str, str]) -> bool:
-    moving = ('guide_x', 'guide_z', 'roll')
-    given = [role for role in moving if role in steered]
-    try:
-        columns = [tables.column_values(table, role, steered[role], []) for role in given]
-    except RecordingError:
-        return False
-    return any(np.nanmax(values) > np.nanmin(values) for values in columns)
+    with suppress(RecordingError):
+        return any(
+            np.ptp(measured_values(tables.column_values(table, role, steered[role], []))) > least
+            for role, least in _STEERED.items()
+            if role in steered
+        )
+    return False
 
 
 def _table(path: Path) -> Inspection:

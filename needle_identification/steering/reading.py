@@ -200,7 +200,7 @@ def steering_columns(table: Table, given: Mapping[str, str] | None = None) -> di
     if 'depth' not in specs:
         return {**specs, **given}
     units = _units(table, specs, given)
-    depth = _measured(table.columns[specs['depth']])
+    depth = measured_values(table.columns[specs['depth']])
     for role, unit in units.items():
         if unit_of(specs[role], role) is None and unit:
             specs[role] = f'{specs[role]}[{unit}]'
@@ -220,7 +220,7 @@ def check_depth(table: Table, spec: str) -> None:
     name = spec.lstrip('-')
     if name not in table.columns or unit_of(name, 'depth') is not None:
         return
-    if (span := float(np.ptp(_measured(table.columns[name])))) > _LARGE:
+    if (span := float(np.ptp(measured_values(table.columns[name])))) > _LARGE:
         raise RecordingError(
             f'{table.path}: {name} spans {span:.3g} without a unit, mm or cm: '
             f"use --columns 'depth={spec}[mm]' or 'depth={spec}[cm]'"
@@ -230,7 +230,7 @@ def check_depth(table: Table, spec: str) -> None:
 def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
     """Return the unit of each role, '' if unknown or in SI units."""
     stated = {role: unit_of(given.get(role, name), role) for role, name in specs.items()}
-    moved = {role: _measured(table.columns[name]) for role, name in specs.items()}
+    moved = {role: measured_values(table.columns[name]) for role, name in specs.items()}
     bodies = {
         role: re.sub(r'^[xyz]|[xyz123]$', '', tables.plain_name(name))
         for role, name in specs.items()
@@ -264,7 +264,7 @@ def _along(table: Table, depth: float) -> set[str]:
     names = tables.guessed(table.columns, _TIP_ALONG)
     if 'along' not in names or not depth:
         return set()
-    span = float(np.ptp(_measured(table.columns[names['along']])))
+    span = float(np.ptp(measured_values(table.columns[names['along']])))
     for unit in ('m', 'cm', 'mm'):
         if _ALONG < span * UNITS['depth'][unit] / depth < 1.0 / _ALONG:
             return {'' if unit == 'm' else unit}
@@ -288,7 +288,7 @@ def new_rows(table: Table, specs: Mapping[str, str]) -> tuple[BoolArray, list[st
     return new, times
 
 
-def _measured(column: FloatArray) -> FloatArray:
+def measured_values(column: FloatArray) -> FloatArray:
     """Return the values of a column without those that are missing, at least one."""
     found = column[np.isfinite(column)]
     return found if len(found) else np.zeros(1)

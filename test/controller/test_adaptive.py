@@ -23,7 +23,17 @@ from needle_controller import (
     Setpoint,
     Uncertainty,
 )
-from needle_controller.compiled.laws import bounds, correction, LEARNED, MEASURED
+from needle_controller.compiled.laws import (
+    adapt,
+    bounds,
+    correction,
+    FOLLOWS,
+    INTEGRAL,
+    LEARNED,
+    MEASURED,
+    POSITION,
+    VELOCITY,
+)
 from needle_controller.laws.law import SampledLoop
 from needle_controller.stability import LinearLoop
 from needle_dynamics import NeedleModel, NeedleParameters
@@ -172,6 +182,23 @@ def test_adaptive_law_tracks_better_than_inverse_dynamics(delay: int) -> None:
     assert np.abs(learned.final).max() < 1e-5
 
 
+@pytest.mark.parametrize('direction', [1.0, -1.0])
+def test_learned_friction_is_taken_out_of_the_integral(direction: float) -> None:
+    """The force of the law is equal before and after a period in which it learns."""
+    own = law(replace(PHANTOM, withdrawal=0.7))
+    loop = SampledLoop(own, 1, 20.0)
+    memory, speed = loop.memory, direction * 0.01
+    memory[[INTEGRAL, POSITION, VELOCITY, FOLLOWS]] = 1e-4, 0.06, speed, 1.0
+    memory[MEASURED : MEASURED + 3] = 1.0, 0.06 - speed * PERIOD, speed
+    # The acceleration of the modeled motion is zero at its own setpoint.
+    at = (0.06, speed, Setpoint(0.06, speed))
+    before, block = own.force(*at, memory), memory[LEARNED:].copy()
+    adapt(own.packed, memory, 0.06, speed, direction * 5.0)
+    assert np.abs(memory[LEARNED:] - block).max() > 0.01
+    # Rounding of forces of a few newtons.
+    assert own.force(*at, memory) == pytest.approx(before, abs=1e-12)
+
+
 def test_learning_is_bumpless() -> None:
     """A light needle with more friction than modeled does not lunge when it breaks away."""
     nominal = NeedleParameters(
@@ -186,9 +213,11 @@ def test_learning_is_bumpless() -> None:
     plant = replace(nominal, coulomb_friction=1.22 * 16.9)
     start = NeedleModel(plant).state_at(0.1)
     run = run_controller(steering, plant, start, duration=6.0, step=1e-3)
-    # Added to the integral, which has compensated it, the learned friction led to 11.5 mm.
-    assert run.depth.max() < 0.1266 + 2e-4
-    assert abs(run.depth[-1] - 0.1266) < 2e-4
+    # Added to the integral, which has compensated it, the learned friction led to 11.5 mm. The
+    # needle rests up to 0.5 dmu_s / m h^2 = 0.042 mm from its target, and its motion at the end is
+    # as long again.
+    assert run.depth.max() < 0.1266 + 1e-4
+    assert abs(run.depth[-1] - 0.1266) < 1e-4
 
 
 def test_controller_reports_learned_friction() -> None:

@@ -248,6 +248,7 @@ def test_cubics_are_accepted_if_and_only_if_they_are_within_limits(
         assert excess <= 0.0
         assert beyond <= 0.0
         found = [path.at(t).position for t in sampled.tolist()]
+        # Rounding.
         assert_allclose(found, spline(sampled), rtol=1e-9)
 
 

@@ -71,6 +71,7 @@ def test_unknown_unit_is_rejected(tmp_path: Path, run: Any, head: str, unit: str
     assert f"the unit '{unit}'" in inspect_recording(path).lacking
     units = {'time': 's', 'depth': 'm', 'force': 'N'}
     given = {role: f'{name}[{units[role]}]' for role, name in roles.items()}
+    # Nine digits are written.
     assert_allclose(read_friction_recording(path, columns=given).force, run[2], rtol=1e-8)
 
 
@@ -78,6 +79,7 @@ def test_units_of_inches_and_indices(tmp_path: Path, run: Any) -> None:
     """Inches are read in brackets; an index in brackets is no unit, an ending no inch."""
     time, depth, force = run
     path = written(tmp_path, lines('time [s],depth [in],force [N]', time, depth / 0.0254, force))
+    # Nine digits are written.
     assert_allclose(read_friction_recording(path).depth, depth, rtol=1e-8)
     for name in ('position[0]', 'q_in'):
         path = written(tmp_path, lines(f'time,{name},force', time, depth, force))
@@ -89,6 +91,7 @@ def test_column_of_time_with_a_colon(tmp_path: Path, run: Any) -> None:
     """A whole name is no pair of seconds and nanoseconds."""
     path = written(tmp_path, lines('t:0,q,F', *run))
     found = read_friction_recording(path, columns={'time': 't:0', 'depth': 'q', 'force': 'F'})
+    # Stamps are rounded to nanoseconds, and nine digits are written.
     assert_allclose(found.time, run[0] - run[0][0], atol=1e-8)
 
 

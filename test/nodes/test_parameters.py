@@ -9,13 +9,13 @@ import subprocess
 import sys
 
 from diagnostic_msgs.msg import DiagnosticArray
-from lifecycle_msgs.srv import GetState
 from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.nodes import NODES
 from needle_ros.base_node import LATCHED
 from needle_ros.status import node_of, STALE
 import pytest
+from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
@@ -58,23 +58,31 @@ def test_unchanged_values_may_be_set_while_configured(ros_graph: RosGraph) -> No
     assert 'cannot change while configured' in refused.reason
 
 
-def test_other_requests_are_answered_during_a_whole_file(ros_graph: RosGraph) -> None:
+def test_other_callbacks_are_executed_during_a_whole_file(
+    ros_graph: RosGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As by `ros2 param load`; without a new value, no configuration is published."""
     node, user = ros_graph.add(ControllerNode), ros_graph.node('user')
     client = user.create_client(SetParameters, 'controller/set_parameters')
-    states = user.create_client(GetState, 'controller/get_state')
     found = ros_graph.listen(user, String, 'controller/configuration', LATCHED)
     ros_graph.spin_until(client.service_is_ready, 'the service')
-    ros_graph.spin_until(states.service_is_ready, 'the service')
     ros_graph.spin_until(lambda: found, 'the configuration')
     values = {name: value for name, value in node.values().items() if value != []}
     del values['needle']
     same = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    done: list[Parameter] = []
+    between: set[int] = set()
+    set_parameters = node.set_parameters_atomically
+
+    def counted(group: list[Parameter]) -> SetParametersResult:
+        done.extend(group)
+        return set_parameters(group)
+
+    monkeypatch.setattr(node, 'set_parameters_atomically', counted)
+    node.create_timer(1e-4, lambda: between.add(len(done)))
     everything = client.call_async(SetParameters.Request(parameters=same))
-    state = states.call_async(GetState.Request())
-    ros_graph.spin_until(state.done, 'the state')
-    assert not everything.done()
     ros_graph.spin_until(everything.done, 'the parameters')
+    assert len(between - {0, len(same)}) > 10
     results = everything.result().results
     assert len(results) == len(same)
     assert all(one.successful for one in results)

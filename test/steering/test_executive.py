@@ -55,6 +55,7 @@ def test_motion_is_smooth_proportional_and_monotonic(
 @given(duration=st.floats(100.0, 1e10))
 def test_long_motion_has_few_points(duration: float) -> None:
     """As for a speed of 1e-9 m/s; cubics between the points are exact to 1e-9 of the way."""
+    # Their error is h^4 / 384 times the fourth derivative, at most 360, with h = 1/1000.
     move = smooth(NAMES, np.zeros(3), np.array([0.1, 0.0, 0.0]), duration)
     assert len(move.times) <= 1000
     spline = CubicHermiteSpline(move.times, move.positions[:, 0], move.velocities[:, 0])

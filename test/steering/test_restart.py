@@ -8,16 +8,13 @@ from dataclasses import replace
 import json
 import os
 from pathlib import Path
-from threading import Event
 import time
 from typing import Any
 
 from needle_controller import ExecutiveSettings, SteeringExecutive, SteeringPrior
-from needle_controller.steering import insertion_record
 from needle_controller.steering.insertion_record import RecordFile, SteeringRecord
 from needle_controller.steering.motion import JointMotion
 from needle_ros.errors import MessageError, ParameterError
-from needle_ros.files import write_whole
 from needle_ros.status import SteeringPhase
 from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT, STOP
 import numpy as np
@@ -258,23 +255,17 @@ def until(condition: Callable[[], object]) -> None:
 
 
 @pytest.mark.requirement('S-280')
-def test_newest_record_is_written_when_a_blocked_disk_responds(
-    written: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of three records that wait for the disk, the last."""
-    responds = Event()
-
-    def write(path: Path, content: bytes) -> None:
-        assert responds.wait(60.0)
-        write_whole(path, content)
-
-    monkeypatch.setattr(insertion_record, 'write_whole', write)
+def test_newest_record_is_written_when_a_blocked_disk_responds(written: Path) -> None:
+    """A writer of a FIFO without a reader waits, as for a disk without a response."""
     file = RecordFile('/steering', 47)
+    draft = written.with_name(f'{written.name}.{os.getpid()}.tmp')
+    os.mkfifo(draft)
     for record in 'abc':
         with pytest.raises(ParameterError, match=r'is not written within 0\.05 s'):
             file.write(record, 'robot')
-    responds.set()
-    until(lambda: written.is_file() and json.loads(written.read_text())['record'] == 'c')
+    disk = os.open(draft, os.O_RDONLY | os.O_NONBLOCK)
+    until(written.is_file)
+    os.close(disk)
     assert json.loads(written.read_text()) == {'source': 'robot', 'record': 'c'}
     # The disk responds: an error or a record is known at the end of the call.
     file.write('d', 'robot')
