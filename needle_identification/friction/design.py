@@ -23,6 +23,7 @@ from needle_identification.estimation.screening import Screening, Trial
 from needle_identification.friction.filtering import FilteredSignals, HALF_LENGTH
 from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 import numpy as np
+from scipy.fft import next_fast_len
 from scipy.ndimage import maximum_filter1d
 
 FEWEST_SAMPLES: Final = 10.0  #: smallest number of independent samples in motion
@@ -125,8 +126,9 @@ class Design:
         x = np.where(self.used[:, np.newaxis], self._chosen, 0.0)
         column -= x @ (np.linalg.pinv(x.T @ x, hermitian=True) @ (x.T @ column))
         # The error is the root mean square over all shifts in time.
-        shifted = np.fft.irfft(np.fft.rfft(column).conj() * np.fft.rfft(residual), len(column))
-        return float(shifted[0] / np.sqrt(np.mean(shifted**2)))
+        size = next_fast_len(len(column), real=True)
+        shifted = np.fft.rfft(column, size).conj() * np.fft.rfft(residual, size)
+        return float(column @ residual / np.sqrt(np.mean(np.fft.irfft(shifted, size) ** 2)))
 
     def doubt_at_reversals(self) -> float:
         """Return the p-value of a delayed sign of friction, and of breakaway, at reversals."""
