@@ -9,8 +9,10 @@ two columns, seconds and nanoseconds, is ``time=sec:nanosec``.
 """
 
 from array import array
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE, getincrementaldecoder
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+import csv
 from datetime import datetime
 from itertools import islice
 import os
@@ -329,13 +331,13 @@ def _text(path: Path) -> Table:
             _lines(path), delimiter=separator, skiprows=first, ndmin=2, comments=('#', '%')
         )
         lost = 0
-    except (ValueError, UnicodeDecodeError):
-        # Text, gaps, or decimal commas.
+    except ValueError:
+        # Text, gaps, quotes, or decimal commas.
         table, lost = _rows(path, first, separator, count)
     losses = [f'{lost} lines not readable, left out'] if lost else []
     with path.open('rb') as stream:
-        stream.seek(-1, os.SEEK_END)
-        if stream.read(1) not in b'\r\n':
+        stream.seek(-min(2, path.stat().st_size), os.SEEK_END)
+        if stream.read().rstrip(b'\0')[-1:] not in b'\r\n':
             losses.append('the last line has no end: the file may be cut off')
     known = np.atleast_1d(np.isfinite(table).any(axis=0))
     columns = {name: table[:, k] for k, name in enumerate(names) if known[k]}
@@ -355,7 +357,7 @@ def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[Fl
 
 def _lines(path: Path) -> Iterator[str]:
     """Yield the lines of a file; reject a line longer than a plausible sample."""
-    with path.open(encoding='utf-8-sig', errors='replace') as stream:
+    with path.open(encoding=_encoding(path), errors='replace') as stream:
         while line := stream.readline(_LONGEST_LINE):
             if len(line) == _LONGEST_LINE:
                 raise RecordingError(
@@ -364,12 +366,29 @@ def _lines(path: Path) -> Iterator[str]:
             yield line
 
 
+def _encoding(path: Path) -> str:
+    with path.open('rb') as stream:
+        head = stream.read(_LONGEST_LINE)
+    if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+        return 'utf-16'
+    try:
+        # The last character of this part can be incomplete.
+        getincrementaldecoder('utf-8')().decode(head)
+    except UnicodeDecodeError:
+        return 'cp1252'
+    return 'utf-8-sig'
+
+
 def _separator(line: str) -> str | None:
-    return next((mark for mark in (';', '\t', ',') if mark in line), None)
+    unquoted = re.sub('"[^"]*"', '', line)
+    return next((mark for mark in (';', '\t', ',') if mark in unquoted), None)
 
 
 def _split(line: str, separator: str | None) -> list[str]:
-    return [word.strip().strip('"') for word in line.strip().split(separator)]
+    line = line.strip()
+    quoted = separator and '"' in line
+    words = next(csv.reader([line], delimiter=separator)) if quoted else line.split(separator)
+    return [word.strip().strip('"') for word in words]
 
 
 def _numbers(line: str) -> bool:

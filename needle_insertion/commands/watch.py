@@ -7,6 +7,7 @@ import argparse
 import asyncio
 from contextlib import suppress
 from functools import partial
+from math import isfinite
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
@@ -71,6 +72,8 @@ def run(options: argparse.Namespace) -> int:
         raise ParameterError('--control needs a live insertion: omit --control or the BAG')
     if options.shift is not None and options.other is None:
         raise ParameterError('--shift needs two recordings: add OTHER, or omit --shift')
+    if options.shift is not None and not isfinite(options.shift):
+        raise ParameterError(f'--shift must be finite, got {options.shift} s')
     given = bool(options.anatomy), options.labels is not None
     if any(given) and not (all(given) and options.plan is not None):
         raise ParameterError('--anatomy needs --plan and --labels, and --labels needs --anatomy')

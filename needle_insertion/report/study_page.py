@@ -36,6 +36,8 @@ _MOST: Final = 2**17
 
 _WORST: Final = 10  #: number of worst samples in the list
 
+_FEW: Final = 'too few samples'  #: in place of an interval
+
 
 def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
     """
@@ -75,10 +77,10 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
     cards = [('Samples', f'{study.samples}', f'seed {study.design.seed}, {study.design.name}')]
     if hit is not None:
         value, ends = _rounded(hit, '%')
-        cards.append(('Hit', value, f'95 %: {ends}'))
+        cards.append(('Hit', value, _note(ends)))
     value, ends = _rounded(summary.quantile(values, 0.5, study.design), units[main])
     unit, _ = _shown(units[main])
-    cards.append((f'Median {main}', f'{value} {unit}', f'95 %: {ends} {unit}'))
+    cards.append((f'Median {main}', f'{value} {unit}', _note(ends, unit)))
     pictures = [_distribution(main, metrics[main], values)]
     if drawn:
         pictures += _map(main, metrics[main], values, most, study)
@@ -114,7 +116,7 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
     )
     for name in order if shares else ():
         value, ends = _rounded(_influence(shares[name]), '%')
-        cards.append((f'Variance by {name}', value, f'95 %: {ends}'))
+        cards.append((f'Variance by {name}', value, _note(ends)))
     return cards
 
 
@@ -135,7 +137,11 @@ def _rounded(one: summary.Estimate, unit: str) -> tuple[str, str]:
     sign = unit if unit == '%' else ''
     ends = [f'{end:{form}}{sign}' for end in (low, high) if isfinite(end)]
     bound = '' if len(ends) == 2 else '≥ ' if isfinite(low) else '≤ '
-    return f'{value:{form}}{sign}', bound + ' to '.join(ends) if ends else 'too few samples'
+    return f'{value:{form}}{sign}', bound + ' to '.join(ends) if ends else _FEW
+
+
+def _note(ends: str, unit: str = '') -> str:
+    return ends if ends == _FEW else f'95 %: {ends} {unit}'.rstrip()
 
 
 def _influence(one: summary.Indices) -> summary.Estimate:

@@ -460,6 +460,14 @@ def test_pages_limit_the_number_of_samples(
     assert f'>{last}<' in text
 
 
+def test_page_of_one_sample_has_no_intervals(tmp_path: Path) -> None:
+    results = Results(tmp_path / 'results', build_study({**SMALL, 'samples': 1}))
+    compute(results, here, 1, lambda _: None)
+    page.write_study(results, tmp_path / 'study.html')
+    text = (tmp_path / 'study.html').read_text(encoding='utf-8')
+    assert re.search('Median miss.*?>too few samples<', text, re.DOTALL)
+
+
 def test_open_loop_equals_a_guide_at_rest(tmp_path: Path) -> None:
     """The batch gives the same tips as single insertions."""
     free = {**SMALL, 'settings': {**SMALL['settings'], 'law': 'open_loop'}}

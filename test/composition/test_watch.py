@@ -955,3 +955,5 @@ def test_exclusive_options_are_rejected(watched: Path, capsys: pytest.CaptureFix
     assert 'error: --control needs a live insertion' in capsys.readouterr().err
     assert cli.main(['watch', str(watched), '--shift', '2s']) == 2
     assert 'error: --shift needs two recordings' in capsys.readouterr().err
+    assert cli.main(['watch', str(watched), str(watched), '--shift', 'nan']) == 2
+    assert 'error: --shift must be finite, got nan s' in capsys.readouterr().err

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
+import re
 from typing import Any
 
 from hypothesis import given
@@ -48,10 +49,23 @@ def run() -> tuple[Any, Any, Any]:
     return made.time, made.depth, made.force
 
 
-def written(folder: Path, text: str, name: str = 'run.csv') -> Path:
+def written(folder: Path, text: str, name: str = 'run.csv', encoding: str = 'utf-8') -> Path:
     path = folder / name
-    path.write_text(text, encoding='utf-8')
+    path.write_text(text, encoding=encoding)
     return path
+
+
+@pytest.mark.parametrize('encoding', ['utf-8', 'utf-8-sig', 'utf-16', 'cp1252'])
+def test_encodings_of_spreadsheets(tmp_path: Path, run: Any, encoding: str) -> None:
+    """The micro sign of a unit, and the end of the last line, are found in each."""
+    time, depth, force = run
+    text = lines('time [s]\tposition [µm]\tforce [N]', time, 1e6 * depth, force, separator='\t')
+    path = written(tmp_path, text, encoding=encoding)
+    # Nine digits are written.
+    assert_allclose(read_friction_recording(path).depth, depth, rtol=1e-8)
+    assert read_table(path).losses == []
+    cut = read_table(written(tmp_path, text[:-1], encoding=encoding))
+    assert cut.losses == ['the last line has no end: the file may be cut off']
 
 
 @pytest.mark.parametrize(
@@ -116,6 +130,10 @@ FORMS: dict[str, tuple[Callable[..., str], dict[str, str]]] = {
     ),
     'decimal commas': (
         lambda t, q, f: lines('t;q;F', t, q, f, separator=';').replace('.', ','), NAMED,
+    ),
+    'quoted decimal commas': (
+        lambda t, q, f: re.sub('[^,\n]+', r'"\g<0>"', lines('t,q,F', t, q, f)).replace('.', ','),
+        NAMED,
     ),
     'seconds and nanoseconds': (
         lambda t, q, f: lines(
