@@ -17,7 +17,7 @@ from needle_controller import (
     SteeringFaultError,
     SteeringModel,
 )
-from needle_controller.steering.simulation import step_depths
+from needle_controller.steering.settings import step_depths
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, FloatArray, NeedleParameters
 from needle_dynamics.arrays import BoolArray
 from needle_study.gym.pushed import FORCE, PERIOD, UNITS

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array types shared by all packages."""
+"""Array types shared by all packages, and checked arrays."""
 
+from collections.abc import Sequence
+from reprlib import repr as shortened
 from typing import Annotated, NamedTuple, TypeAlias
 
+from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,5 +34,29 @@ ComplexVector: TypeAlias = Annotated[ComplexArray, Shaped(np.complex128, 1)]
 ComplexMatrix: TypeAlias = Annotated[ComplexArray, Shaped(np.complex128, 2)]
 ComplexArray3: TypeAlias = Annotated[ComplexArray, Shaped(np.complex128, 3)]
 IntVector: TypeAlias = Annotated[IntArray, Shaped(np.int64, 1)]
-IntMatrix: TypeAlias = Annotated[IntArray, Shaped(np.int64, 2)]
 BoolVector: TypeAlias = Annotated[BoolArray, Shaped(np.bool_, 1)]
+
+
+def floats(name: str, values: object, shape: Sequence[int | None] | None = None) -> FloatArray:
+    """
+    Return a copy of finite numbers as an array, of a shape if it is given; None is any length.
+
+    Raises ShapeError for another shape and for text, and ParameterError for infinity and nan.
+    """
+    try:
+        found = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ShapeError(f'{name} must be numbers, got {shortened(values)}') from None
+    if shape is not None and not _fits(found.shape, shape):
+        lengths = ', '.join('n' if length is None else str(length) for length in shape)
+        lengths += ',' * (len(shape) == 1)
+        raise ShapeError(f'{name} must have shape ({lengths}), got {found.shape}')
+    if not np.isfinite(found).all():
+        raise ParameterError(f'{name} must be finite, got {found[~np.isfinite(found)][0]}')
+    return found
+
+
+def _fits(found: Sequence[int], shape: Sequence[int | None]) -> bool:
+    return len(found) == len(shape) and all(
+        wanted in (None, length) for length, wanted in zip(found, shape, strict=True)
+    )

@@ -16,7 +16,7 @@ from functools import cached_property
 from math import inf, isfinite, pi
 from typing import Any, Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.compiled.integrals import ModeIntegrals, tip_deflections
 from needle_dynamics.compiled.normal_modes import coupling
 from needle_dynamics.compiled.step import CompiledNeedle
@@ -119,17 +119,8 @@ class NeedleModel:
         return ('d', 'theta', *(f'q{i + 1}' for i in range(self.parameters.modes)))
 
     def checked_state(self, state: ArrayLike) -> FloatArray:
-        """Return a copy of a state, or raise ShapeError or InsertionDepthError."""
-        try:
-            checked = np.array(state, dtype=float)
-        except (TypeError, ValueError):
-            raise ShapeError(f'state must be numbers, got {state!r}') from None
-        if checked.shape != (2 * self.coordinates,):
-            raise ShapeError(
-                f'state must have shape ({2 * self.coordinates},), got {checked.shape}'
-            )
-        if not np.isfinite(checked).all():
-            raise ShapeError(f'state must be finite, got {checked.tolist()}')
+        """Return a copy of a state, or raise NeedleError."""
+        checked = floats('state', state, (2 * self.coordinates,))
         p = self.parameters
         depth = p.length - checked[0]
         high = self.modes.reach * p.length
@@ -259,9 +250,7 @@ class NeedleModel:
         within its bounds that minimizes the required force.
         """
         now, m = self._instant(state, time), self.coordinates
-        wanted = np.array(acceleration, dtype=float)
-        if wanted.shape != (m,) or not np.isfinite(wanted).all():
-            raise ShapeError(f'acceleration must be finite with shape ({m},), got {wanted}')
+        wanted = floats('acceleration', acceleration, (m,))
         forces = self._mass(now.at) @ wanted + self._bias(now)
         # From rest, an infinite drive gives the friction that opposes the starting motion.
         drive = -np.sign(wanted[0]) * np.inf if wanted[0] != 0.0 else forces[0]

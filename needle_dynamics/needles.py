@@ -13,7 +13,8 @@ from typing import Any, Final, NamedTuple
 from needle_dynamics.parameters import NeedleParameters, PAPER_NEEDLE, PRESETS
 from needle_dynamics.steering.parameters import STEEL, SteeringParameters, tissue_of
 from needle_ros.errors import ParameterError
-from needle_ros.files import read_document
+from needle_ros.files import read_yaml
+from needle_ros.parameter_file import sections_of
 from needle_ros.quantities import quantity
 from needle_ros.settings import from_values, is_number, unknown_name
 
@@ -44,7 +45,7 @@ class NeedlePreset(NamedTuple):
         known = [item.name for part in (self.needle, self.steering) for item in fields(part)]
         for name in values:
             if name not in known:
-                raise ParameterError(unknown_name(name, [*known, *DIAMETERS]))
+                raise ParameterError(unknown_name(str(name), [*known, *DIAMETERS]))
 
         def replaced(part: Any) -> Any:
             own = {item.name: values[item.name] for item in fields(part) if item.name in values}
@@ -151,12 +152,7 @@ def find_needle(name: str) -> NeedlePreset:
         raise ParameterError(f'needle must be {NEEDLE_HELP}, got {name!r}{meant}')
     if name in NEEDLES:
         return NEEDLES[name]
-    try:
-        document = read_document(Path(name).expanduser().read_text(encoding='utf-8'))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise ParameterError(f'needle {name} cannot be read: {reason}') from error
-    return _based(name, document)
+    return _based(name, read_yaml(Path(name).expanduser()))
 
 
 def usable_needle(name: str) -> str:
@@ -171,13 +167,9 @@ def usable_needle(name: str) -> str:
 def _based(name: str, document: object) -> NeedlePreset:
     given = document if isinstance(document, dict) else {}
     values: dict[str, Any] = {str(key): value for key, value in given.items()}
-    sections = [
-        part['ros__parameters']
-        for part in values.values()
-        if isinstance(part, dict) and isinstance(part.get('ros__parameters'), dict)
-    ]
+    sections = [section for _, section in sections_of(document)]
     if sections:
-        found = {str(key): value for part in sections for key, value in part.items()}
+        found = {str(key): value for section in sections for key, value in section.items()}
         values = {
             key.rpartition('.')[2]: value
             for key, value in found.items()

@@ -12,13 +12,7 @@ from needle_dynamics.model_node import ModelNode
 from needle_dynamics.needles import usable_needle
 from needle_dynamics.plant_inputs_node import PlantCommanders, PlantTrajectories
 from needle_dynamics.plant_outputs_node import PlantDisplay, SamplePublishers, SampleReports
-from needle_dynamics.simulated.assembly import (
-    build_sample_clock,
-    defaults_of,
-    LARGEST_SEED,
-    MODES,
-    SETTINGS,
-)
+from needle_dynamics.simulated.assembly import build_sample_clock, defaults_of, MODES, SETTINGS
 from needle_dynamics.simulated.faults import FaultParameters, FAULTS, FAULTY, SensorFault
 from needle_dynamics.simulated.run import Event, PARAMETERS, PlantRun, RESET, TARE
 from needle_ros import contract
@@ -27,6 +21,7 @@ from needle_ros.errors import JobError, NeedleError, ParameterError, printable
 from needle_ros.event_log import Severity
 from needle_ros.publishers_node import offer_lease
 from needle_ros.run_node import run
+from needle_ros.settings import LARGEST_SEED
 from needle_ros.status import Diagnosis, PlantPhase, PlantStatus
 from needle_ros.system_state import Authority, Mode
 from needle_ros.system_state_node import SystemStateTopics
@@ -168,7 +163,7 @@ class PlantNode(ModelNode):
         constants.make().take(0.0, 0.0)
         offer_lease(self, contract.MEASURER)
         self._samples = SamplePublishers(self, plant_run)
-        self._set_fault({})
+        self._samples.fault, self._samples.faulty = self._fault({})
         self._display = PlantDisplay(self)
         self._display.use_frames(self.text('frame_prefix'))
         self._commanders = PlantCommanders(
@@ -206,20 +201,21 @@ class PlantNode(ModelNode):
 
     def change(self, changes: Mapping[str, Any]) -> None:
         """Apply changed friction or fault parameters; the state is kept."""
+        fault = self._fault(changes)
         if self._run is not None:
             self._run.perform(Event(PARAMETERS, changes))
         if any(name.startswith('fault.') for name in changes):
-            self._set_fault(changes)
+            self._samples.fault, self._samples.faulty = fault
 
-    def _set_fault(self, changes: Mapping[str, Any]) -> None:
+    def _fault(self, changes: Mapping[str, Any]) -> tuple[SensorFault | None, str]:
+        """Return the fault of the parameters, and the topic that has it."""
         kind = self.text('fault.kind', (_NO_FAULT, *FAULTS), changes)
         topic = self.text('fault.topic', tuple(FAULTY), changes)
         parameters = self.settings('fault.', FaultParameters, changes)
-        samples = self._samples
-        samples.fault, samples.faulty = None, topic
-        if kind != _NO_FAULT:
-            rate, seed = self.get_parameter('rate').value, self.get_parameter('seed').value
-            samples.fault = SensorFault(kind, parameters, float(rate), seed)
+        if kind == _NO_FAULT:
+            return None, topic
+        rate, seed = self.get_parameter('rate').value, self.get_parameter('seed').value
+        return SensorFault(kind, parameters, float(rate), seed), topic
 
     def activate(self) -> None:
         if self._run is None:
@@ -356,7 +352,7 @@ class PlantNode(ModelNode):
         plant_run.perform(Event(RESET))
         self._trajectories.begin()
         self._halted = None
-        self._set_fault({})
+        self._samples.fault, self._samples.faulty = self._fault({})
         return 'needle and noise reset; time continues'
 
     # Samples.

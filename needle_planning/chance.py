@@ -19,7 +19,7 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.display import Displayed
 from needle_planning.anatomy import Anatomy
 from needle_ros.errors import missing_extra, ParameterError
-from needle_ros.files import DocumentError, read_document
+from needle_ros.files import read_yaml
 from needle_ros.process_pool import processes
 from needle_ros.settings import check_whole, is_number
 from needle_study.distribution import from_table
@@ -301,7 +301,7 @@ def _tables(study: Study) -> dict[str, Any]:
 
 
 def _largest(success: FloatArray, study: Study) -> tuple[tuple[str, Estimate], ...]:
-    if success.all():
+    if success.all() or not success.any():
         return ()
     found = indices(success, {}, study)
     firsts = {_NOISE if name == NOISE else name: one.first for name, one in found.items()}
@@ -395,8 +395,9 @@ def read_population(path: Path | str) -> tuple[dict[str, Any], list[Any]]:
 
     """
     path = Path(path)
+    content = read_yaml(path)
     try:
-        document = mapping('a population', read_document(path.read_text(encoding='utf-8')))
+        document = mapping('a population', content)
         check_names('', document, _KEYS)
         given = mapping('population', document.get('population'))
         if not given:
@@ -414,9 +415,6 @@ def read_population(path: Path | str) -> tuple[dict[str, Any], list[Any]]:
             {'scenario': _SCENARIO, 'settings': settings, 'population': found,
              'correlations': correlations}
         )  # fmt: skip
-    except (DocumentError, ParameterError) as error:
+    except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else 'it is not text'
-        raise ParameterError(f'{path}: {reason}') from error
     return found, correlations

@@ -16,7 +16,7 @@ from needle_planning.anatomy import Anatomy, COVERS, ROLES, SegmentationError, S
 from needle_planning.segmentation import read_layers
 from needle_planning.voxels import LARGEST_VALUE, Layer, MOST_VOXELS, planes, present, SPACES
 from needle_ros.errors import ParameterError, shown
-from needle_ros.files import DocumentError, LARGEST, read_document
+from needle_ros.files import read_yaml
 from needle_ros.settings import (
     check_choice,
     CheckedSettings,
@@ -93,14 +93,11 @@ def read_labels(path: Path | str) -> Labels:
     ParameterError
         If it is not readable or invalid, with its name and the valid keys.
     """
+    document = read_yaml(path)
     try:
-        with Path(path).open(encoding='utf-8') as stream:
-            return _labels(read_document(stream.read(LARGEST + 1)))
-    except (DocumentError, ParameterError) as error:
+        return _labels(document)
+    except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else 'it is not text'
-        raise ParameterError(f'{path}: {reason}') from error
 
 
 def _labels(document: Any) -> Labels:

@@ -16,13 +16,12 @@ from itertools import product
 from math import ceil, cos, inf, pi, sin, sqrt
 from typing import Any, Final, NamedTuple
 
-from needle_controller.steering.settings import SteeringLimits
+from needle_controller.steering.settings import SteeringLimits, step_depths
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import inserted_shape, SteeredNeedle
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_planning.clearance import Clearance
-from needle_ros.errors import ParameterError
 import numpy as np
 
 #: Largest slope of a planned needle relative to its line: the model is for small slopes, and its
@@ -41,7 +40,6 @@ _ROUNDS: Final = 12  #: Most linear programs of a path.
 _GAIN: Final = 1e-5  #: Least gain of clearance by a linear program [m].
 _LEAST_MOVE: Final = 5e-5  #: Trust region at which the search ends [m].
 _BEFORE: Final = 0.9  #: Fraction of the line that a first bow can move.
-_MOST_STEPS: Final = 200  #: Most steps of an insertion.
 
 
 def needle_radius(needle: NeedleParameters) -> float:
@@ -87,17 +85,6 @@ class PathResponses:
     def tip(self) -> int:
         """Row of the tip at the target."""
         return int(self.tips[-1])
-
-
-def step_depths(length: float, step: float) -> FloatArray:
-    """Return the depths of equal steps to a length [m], each at most a step [m]."""
-    steps = max(1, ceil(length / step - 1e-6))
-    if steps > _MOST_STEPS:
-        raise ParameterError(
-            f'it would take {steps} steps of {1e3 * step:g} mm, at most {_MOST_STEPS} are '
-            'possible: increase step_length'
-        )
-    return np.linspace(0.0, length, steps + 1)
 
 
 def path_responses(

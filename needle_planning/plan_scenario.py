@@ -228,6 +228,8 @@ class PlanScenario(Scenario):
         """Return the file of the plan, and segmentations and labels, or the folder of all."""
         given = [name for name in _FILES if name in settings]
         if 'folder' in settings and not given:
+            if not isinstance(settings['folder'], str):
+                raise ParameterError(f'settings: folder must be text, got {settings["folder"]!r}')
             return Path(settings['folder']), [], ''
         if given != list(_FILES) or 'folder' in settings:
             raise ParameterError(

@@ -8,8 +8,8 @@ from math import inf, isfinite
 from typing import Final, TypeAlias
 
 from needle_controller.steering.insertion_plan import guide_axes, in_layers, Plan
-from needle_controller.steering.settings import SteeringLimits
-from needle_dynamics.arrays import FloatArray
+from needle_controller.steering.settings import SteeringLimits, step_depths
+from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle, NeedlePreset
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
@@ -25,7 +25,6 @@ from needle_planning.paths import (
     path_responses,
     SKIN_LIMIT,
     STEEPEST,
-    step_depths,
 )
 from needle_planning.search import disc_region, EntryRegion, Lines, search_lines, voxel_region
 from needle_ros.errors import JobError, ParameterError
@@ -376,10 +375,7 @@ class _Planner:
 
 
 def _point(name: str, values: ArrayLike) -> FloatArray:
-    found = np.array(values, dtype=np.float64)
-    if found.shape != (3,) or not np.isfinite(found).all():
-        raise ParameterError(f'{name} must have 3 finite coordinates, got {values!r}')
-    return found
+    return floats(name, values, (3,))
 
 
 def _usable(name: str) -> NeedlePreset:

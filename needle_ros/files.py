@@ -56,10 +56,23 @@ class DocumentError(NeedleError, ValueError):
     """A text is not YAML, or exceeds the limits of `read_document`."""
 
 
+def read_yaml(path: Path | str) -> Any:
+    """Parse a YAML file as `read_document`; raise ParameterError with its name."""
+    try:
+        with Path(path).open(encoding='utf-8') as stream:
+            return read_document(stream.read(LARGEST + 1))
+    except UnicodeDecodeError as error:
+        raise ParameterError(f'{path} is not text in UTF-8') from error
+    except OSError as error:
+        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
+    except DocumentError as error:
+        raise ParameterError(f'{path} {error}') from error
+
+
 def read_document(text: str) -> Any:
     """Parse a YAML document of an external author; aliases could expand beyond the memory."""
     if len(text) > LARGEST:
-        raise DocumentError(f'has {len(text)} characters, at most {LARGEST} are read')
+        raise DocumentError(f'has more than {LARGEST} characters')
     depth = 0
     try:
         for event in yaml.parse(text, Loader=_Loader):

@@ -12,6 +12,7 @@ from sys import float_info
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.parameter_file import MARK, sections_of
 from needle_ros.quantities import quantity
 from needle_ros.services_node import ParameterServices
 from needle_ros.settings import check_choice, constraints, from_values, unknown_name
@@ -21,7 +22,6 @@ from rclpy.parameter import Parameter
 import yaml
 
 _LARGEST = float_info.max  #: Largest finite number.
-_MARK = 'ros__parameters'  #: Key of the parameters in a section of a file.
 _READ_AS_BOOL = ('y', 'n')  #: Strings that rcl parses as booleans in a parameter file.
 
 
@@ -162,7 +162,7 @@ class ParameterNode(LifecycleNode):
     def configuration(self) -> str:
         """Return all parameters as a ROS parameter file (YAML)."""
         values = self.values()
-        document = {self.get_fully_qualified_name(): {'ros__parameters': values}}
+        document = {self.get_fully_qualified_name(): {MARK: values}}
         return str(yaml.dump(document, Dumper=_Dumper, sort_keys=False))
 
     def values(self) -> dict[str, Any]:
@@ -254,7 +254,7 @@ def sections(arguments: Sequence[str]) -> list[ParameterSection]:
     return [
         ParameterSection(file, f'/{name}', frozenset(_flat(values)))
         for file in files
-        for name, values in _nodes(yaml.safe_load(Path(file).read_text(encoding='utf-8')))
+        for name, values in sections_of(yaml.safe_load(Path(file).read_text(encoding='utf-8')))
     ]
 
 
@@ -273,15 +273,6 @@ def shared_names(found: Sequence[ParameterSection], node: str) -> frozenset[str]
     """Return the parameters that wildcard sections (``/**``) set for a node."""
     shared = (one for one in found if '*' in one.nodes.rpartition('/')[2] and one.is_for(node))
     return frozenset(name for section in shared for name in section.names)
-
-
-def _nodes(content: Any, namespace: str = '') -> Iterator[tuple[str, Mapping[str, Any]]]:
-    for name, below in content.items() if isinstance(content, Mapping) else ():
-        path = f'{namespace}/{name}'.strip('/')
-        if isinstance(below, Mapping) and _MARK in below:
-            yield path, below[_MARK] or {}
-        else:
-            yield from _nodes(below, path)
 
 
 def _flat(values: Mapping[str, Any], prefix: str = '') -> Iterator[str]:

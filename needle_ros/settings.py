@@ -18,6 +18,8 @@ _Settings = TypeVar('_Settings')
 
 _LISTS: Final = (list, array, type(None))  #: Types accepted for a tuple.
 
+LARGEST_SEED: Final = 2**62  #: Integer parameters have 64 bits.
+
 #: Names of the types of fields and parameters.
 _NAMES: Final = {
     bool: 'true or false', str: 'text', list: 'a list of text', tuple: 'a list of numbers',
@@ -225,5 +227,5 @@ def unknown_name(name: str, valid: Iterable[str]) -> str:
     """Return the error message for an unknown parameter, with the nearest valid name."""
     names = sorted(valid)
     close = get_close_matches(name, names, n=1)
-    hint = f'did you mean {close[0]!r}?' if close else f'valid: {", ".join(names)}'
+    hint = f'did you mean {close[0]!r}?' if close else f'valid: {", ".join(names) or "none"}'
     return f'unknown parameter {name!r}; {hint}'

@@ -2,7 +2,7 @@
 """Distributions of one variable, as defined in a study file."""
 
 from collections.abc import Callable, Mapping, Sequence
-from csv import DictReader
+import csv
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, repeat
@@ -194,12 +194,13 @@ def from_table(name: str, given: Any, folder: Path) -> Any:
     file, column = where
     try:
         with (folder / file).open(encoding='utf-8-sig', newline='') as stream:
-            rows = list(DictReader(stream))
+            reader = csv.DictReader(stream)
+            rows = list(reader)
         return {_ROWS: [float(row[column]) for row in rows], _OF: file}
     except KeyError:
-        has = ', '.join(rows[0])
+        has = ', '.join(reader.fieldnames or ())
         raise ParameterError(f'{name}: {file} has no column {column!r}, it has {has}') from None
-    except (OSError, ValueError, TypeError) as error:
+    except (OSError, ValueError, TypeError, csv.Error) as error:
         raise ParameterError(f'{name}: {file} cannot be read: {error}') from error
 
 

@@ -10,10 +10,10 @@ from typing import Any, Final
 from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
 from needle_controller.steering import simulation
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, SteeringFaultError
-from needle_controller.steering.settings import SIMULATION_LIMITS, SteeringLimits
-from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch, NeedleParameters
+from needle_controller.steering.settings import SIMULATION_LIMITS, SteeringLimits, step_depths
+from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch
 from needle_dynamics.simulated.tip_sensor import TipErrorParameters
-from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
+from needle_dynamics.steering.parameters import with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values, same_field
@@ -29,7 +29,6 @@ _SPEED: Final = 0.01  #: insertion speed of a replay [m/s]
 _JOINTS: Final = contract.steered_states(efforts=False)
 _EXACT: Final = simulation.SteppedTipErrors()  # of a sensor with white noise alone
 _SEEDS: Final = 2**63  #: upper bound of the seeds of paths
-_MOST: Final = 1000  #: most steps of an insertion
 _SHORTEST: Final = 1e-6  # lower bound of times and lengths of errors [s, m]
 _AT_ONCE: Final = 256  #: insertions per batch, which are in memory together
 _PARTS: Final = ('needle', 'constants', 'prior', 'law')  #: settings that are mappings or words
@@ -90,13 +89,14 @@ class SteeringScenario(Scenario):
         self._numbers = numbers = from_values(
             SteeringStudy, {**asdict(SIMULATION_LIMITS), **given}, 'settings.'
         )
-        needle, steering, _ = find_needle(settings.get('needle', DEFAULT_NEEDLE))
+        nominal = find_needle(settings.get('needle', DEFAULT_NEEDLE))
         self._law = str(settings.get('law', DEFAULT_LAW))
         find_law(self._law)
-        given = dict(scenario.mapping('settings: constants', settings.get('constants')))
-        of_needle = {name: given.pop(name) for name in asdict(needle) if name in given}
-        self._needle = from_values(NeedleParameters, {**asdict(needle), **of_needle})
-        self._steering = from_values(SteeringParameters, {**asdict(steering), **given})
+        constants = scenario.mapping('settings: constants', settings.get('constants'))
+        try:
+            self._needle, self._steering, _ = nominal.changed(constants)
+        except ParameterError as error:
+            raise ParameterError(f'settings.constants: {error}') from error
         prior = scenario.mapping('settings: prior', settings.get('prior'))
         self._prior = from_values(SteeringPrior, prior, 'settings.prior.')
         reach = self._needle.length - self._steering.free_length
@@ -105,11 +105,7 @@ class SteeringScenario(Scenario):
                 f'settings.depth must be <= {reach:g} m, the length of the needle without its '
                 f'free length, got {numbers.depth:g} m'
             )
-        steps = numbers.depth / numbers.step_length
-        if steps > _MOST:
-            raise ParameterError(
-                f'settings: depth over step_length must be <= {_MOST} steps, got {steps:.3g}'
-            )
+        self._depths = step_depths(numbers.depth, numbers.step_length, name='settings.step_length')
         moves = {
             DEFAULT_LAW: numbers.guide_limit or numbers.turns,
             'broyden': numbers.guide_limit,
@@ -120,7 +116,6 @@ class SteeringScenario(Scenario):
                 f'settings: law {self._law} with guide_limit {numbers.guide_limit:g} and turns '
                 f'{numbers.turns:g} has no actuation'
             )
-        self._depths = simulation.step_depths(numbers.depth, numbers.step_length)
         bevel = max(self._steering.bevel_load)
         noise = self._prior.path_noise
         self.variables: Mapping[str, Variable] = {

@@ -12,8 +12,8 @@ from typing import Any, Final, TYPE_CHECKING
 from needle_dynamics import FloatArray
 from needle_dynamics.display import Displayed, new_figure, Progress, progress_of, shown
 from needle_ros.errors import ParameterError
-from needle_ros.files import DocumentError, read_document
-from needle_ros.settings import check_choice, check_whole, find_class, is_number
+from needle_ros.files import read_yaml
+from needle_ros.settings import check_choice, check_whole, find_class, is_number, LARGEST_SEED
 from needle_study.designs import BELOW, DESIGNS, INSIDE, RandomDesign, SobolDesign
 from needle_study.distribution import Distribution, distribution, from_table
 from needle_study.scenario import check_names, mapping, Scenario, SCENARIOS
@@ -130,19 +130,16 @@ def read_study(path: Path | str) -> Study:
         If it is not readable or invalid, with its name.
     """
     path = Path(path)
+    document = read_yaml(path)
     try:
-        document = read_document(path.read_text(encoding='utf-8'))
         if isinstance(document, dict) and isinstance(given := document.get('population'), dict):
             document['population'] = {
                 name: from_table(f'population: {name}', one, path.parent)
                 for name, one in given.items()
             }
         return build_study(document)
-    except (DocumentError, ParameterError) as error:
+    except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else 'it is not text'
-        raise ParameterError(f'{path}: {reason}') from error
 
 
 def build_study(document: Any) -> Study:
@@ -165,7 +162,9 @@ def build_study(document: Any) -> Study:
     of_class = find_class('scenario', document.get('scenario'), SCENARIOS)
     if not (isinstance(of_class, type) and Scenario in of_class.__mro__):
         raise ParameterError(f'scenario {document["scenario"]!r} is not a subclass of Scenario')
-    samples, seed = (_whole(document, key, low) for key, low in (('samples', 1), ('seed', 0)))
+    samples, seed = (
+        _whole(document, *limits) for limits in (('samples', 1, _MOST), ('seed', 0, LARGEST_SEED))
+    )
     design = document.get('design', SobolDesign.name)
     check_choice('design', design, DESIGNS)
     settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
@@ -196,9 +195,9 @@ def build_study(document: Any) -> Study:
     return Study(scenario, DESIGNS[design](samples, seed, factor), population, content)
 
 
-def _whole(document: Mapping[str, Any], key: str, low: int) -> int:
+def _whole(document: Mapping[str, Any], key: str, low: int, high: int) -> int:
     value = document.get(key, 1)
-    check_whole(key, value, low, _MOST)
+    check_whole(key, value, low, high)
     return int(value)
 
 

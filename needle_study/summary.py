@@ -200,6 +200,9 @@ def _grouped(
     kept = np.isfinite(groups).all(axis=0)
     replicates = (np.arange(count) % REPLICATES)[kept]
     first, second, *others = groups[:, kept]
+    if not np.ptp(groups[:, kept]):
+        none = Estimate(0.0, 0.0, 0.0, len(first))
+        return dict.fromkeys((NOISE, *names), Indices(none, none))
 
     def estimate(one: FloatArray, other: FloatArray, sign: float) -> Estimate:
         powers = (one * other, 0.5 * (one**2 + other**2), 0.5 * (one + other), np.ones(len(one)))

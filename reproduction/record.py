@@ -18,7 +18,7 @@ from needle_insertion.graph.ros_graph import ACTIVATE, CLEANUP, CONFIGURE, DEACT
 from needle_insertion.progress import ProgressLine
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.errors import JobError
-from needle_ros.files import DocumentError, read_document
+from needle_ros.parameter_file import parameters_by_node
 from needle_ros.timing import seconds
 import numpy as np
 from rclpy.duration import Duration
@@ -227,9 +227,9 @@ def _is_finished(bag: Path, protocol: ExperimentProtocol, parameters: Mapping[st
         return False
     try:
         ((_, message),) = read_topic(bag, '/plant/configuration')
-        found = dict(read_document(message.data)['/plant']['ros__parameters'])
+        found = parameters_by_node(message.data)['plant']
         commanded = [_points(message) for _, message in read_topic(bag, '/joint_trajectory')]
-    except (RecordingError, DocumentError, AttributeError, KeyError, TypeError, ValueError):
+    except (RecordingError, AttributeError, KeyError, TypeError, ValueError):
         raise ParameterError(
             f'{bag} exists and is not a run of this experiment; name another folder'
         ) from None

@@ -18,6 +18,7 @@ from needle_controller.laws.law import Law
 from needle_controller.reference.path import Trapezoid
 from needle_controller.reference.setpoint import Reference
 from needle_dynamics import FloatArray, Integrator, NeedleModel, NeedleParameters
+from needle_dynamics.arrays import floats
 from needle_dynamics.compiled.lane_rows import LANES
 from needle_dynamics.display import Progress, progress_of
 from needle_dynamics.simulated.batch import (
@@ -286,15 +287,8 @@ def run_batch(
 
 def _rows(name: str, values: ArrayLike) -> FloatArray:
     """Return finite values as rows, shape (n, 3); empty values have no rows."""
-    try:
-        rows = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ShapeError(f'{name} must be numbers, got {values!r}') from error
-    if rows.size == 0:
-        return np.empty((0, 3))
-    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
-        raise ShapeError(f'{name} must be finite, of shape (n, 3), got {rows.shape}')
-    return rows
+    rows = floats(name, values)
+    return floats(name, rows, (None, 3)) if rows.size else np.empty((0, 3))
 
 
 class LoopInsertion(NamedTuple):

@@ -8,6 +8,7 @@ from typing import Final
 
 from needle_controller.laws.law import BREAKAWAY_TIME
 from needle_dynamics import FloatArray, NeedleModel
+from needle_dynamics.arrays import floats
 from needle_ros.errors import ParameterError, ShapeError
 from needle_ros.settings import check_choice
 import numpy as np
@@ -23,14 +24,11 @@ def _gain_matrix(
     name: str, gains: ArrayLike, size: int, *, may_vanish: bool = False
 ) -> FloatArray:
     """Return gains of ``size`` coordinates as a matrix; reject indefinite gains."""
-    try:
-        matrix = np.array(gains, dtype=float)
-    except (TypeError, ValueError):
-        raise ShapeError(f'{name} must be numbers, got {gains!r}') from None
-    if matrix.shape not in ((size,), (size, size)) or not np.isfinite(matrix).all():
+    matrix = floats(name, gains)
+    if matrix.shape not in ((size,), (size, size)):
         raise ShapeError(
-            f'{name} must be finite with shape ({size},) or ({size}, {size}), one gain for each '
-            f'driven coordinate or a matrix; got shape {matrix.shape}'
+            f'{name} must have shape ({size},) or ({size}, {size}), one gain for each driven '
+            f'coordinate or a matrix; got shape {matrix.shape}'
         )
     if matrix.ndim == 1:
         matrix = np.diag(matrix)
@@ -44,13 +42,6 @@ def _gain_matrix(
         )
     matrix.setflags(write=False)
     return matrix
-
-
-def _finite(name: str, values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    array = np.array(values, dtype=float)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ShapeError(f'{name} must be finite with shape {shape}, got {array.tolist()}')
-    return array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,7 +71,7 @@ class ContinuousLaw(ABC):
     def errors(self, state: FloatArray, goal: ArrayLike) -> FloatArray:
         """Return e = q_d - q, its rate, and the desired acceleration; shape (3, driven)."""
         m, k = self.model.coordinates, self.driven
-        wanted = _finite('goal', goal, (3, m))
+        wanted = floats('goal', goal, (3, m))
         wanted[0] -= state[:m]
         wanted[1] -= state[m:]
         return wanted[:, :k]
@@ -186,7 +177,7 @@ class ContinuousPid(ContinuousLaw):
         del time
         x, k = self.model.checked_state(state), self.driven
         error, rate, _ = self.errors(x, goal)
-        summed = _finite('integral', integral, (self.integrals,))
+        summed = floats('integral', integral, (self.integrals,))
         forces = np.zeros(self.model.coordinates)
         forces[:k] = self._gains[0] @ error + self._gains[1] @ rate
         if self.integrals:
@@ -200,7 +191,7 @@ def acceleration(
     model: NeedleModel, state: ArrayLike, forces: ArrayLike, time: float = 0.0
 ) -> FloatArray:
     """Return q_ddot of (16)-(17) under `ContinuousLaw.forces`; both have shape (2 + n,)."""
-    x, applied = model.checked_state(state), _finite('forces', forces, (model.coordinates,))
+    x, applied = model.checked_state(state), floats('forces', forces, (model.coordinates,))
     result = model.acceleration(x, float(applied[0]), float(applied[1]), time)
     if applied[_BASE:].any():
         # The mass matrix is block diagonal: forces on q1..qn do not act on the base.

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 from needle_controller.compiled.guide_plan import HIT
 from needle_controller.compiled.hypotheses import MOST_MISSING, MOST_SAME
 from needle_controller.steering.law import (
+    checked_tip,
     GuideSetpoint,
     NORMAL,
     SteeringFaultError,
@@ -36,6 +37,14 @@ class AveragedTipMeasurement(NamedTuple):
     error: float  #: standard error along x or z, from the scatter of the readings [m]; 0 for few
     readings: int  #: number of valid readings
     frozen: bool  #: whether at least three readings are identical in x and z
+
+
+class LawReport(NamedTuple):
+    """Members of a law after a measurement, a plan or a change of its target."""
+
+    target: FloatArray  #: x and z [m]
+    warning: str
+    status: Mapping[str, float]
 
 
 class TipMeasurements:
@@ -131,11 +140,19 @@ class GuardedLaw:
         #: [m], or None, with the fields of `AveragedTipMeasurement`, ``at`` and ``depth`` as in
         #: `update`; ``plan`` x, z [m], roll [rad].
         self.history: list[dict[str, Any]] = []
+        with _guarded():
+            self.report = self._reported()
+
+    def _reported(self) -> LawReport:
+        law = self.law
+        status = {name: float(value) for name, value in law.status().items()}
+        return LawReport(checked_tip(law.target, 'the target of a law'), law.warning, status)
 
     def aim(self, target: FloatArray) -> None:
         """Change the target, x and z [m]."""
         with _guarded():
             self.law.aim(target)
+            self.report = self._reported()
         self._warned = False
         self.history.append({'aim': target.tolist()})
 
@@ -182,6 +199,7 @@ class GuardedLaw:
         self._check_sensor(tip)
         with _guarded():
             self.law.update(tip, at, noise)
+            self.report = self._reported()
 
     def _check_slip(self, measured: AveragedTipMeasurement, depth: float) -> None:
         """Compare the depth of the tip with the insertion depth [m]."""
@@ -219,7 +237,7 @@ class GuardedLaw:
         settings, k = self._settings, self.step
         with _guarded():
             to = GuideSetpoint(*map(float, self.law.plan()))
-            self.expected, warning = self.law.expected(), self.law.warning
+            self.expected, self.report = self.law.expected(), self._reported()
         most = settings.guide_limit + _ROUNDING
         # False for nan.
         if not (abs(to.x) <= most and abs(to.z) <= most and isfinite(to.roll)):
@@ -237,10 +255,10 @@ class GuardedLaw:
             )
         self.setpoint, self.step = to, k + 1
         self.history.append({'plan': [*to]})
-        if k < self.steps and warning and not self._warned:
+        if k < self.steps and self.report.warning and not self._warned:
             self._warned = True
             depth = 1e3 * self.depths[k]
-            self._events.add(Severity.WARNING, f'at {depth:.2f} mm: {warning}')
+            self._events.add(Severity.WARNING, f'at {depth:.2f} mm: {self.report.warning}')
         return to
 
     def _frame(self) -> str:
@@ -256,7 +274,7 @@ class GuardedLaw:
         tip, half = measured.tip.copy(), np.full(3, NORMAL * max(measured.error, self._noise))
         if there is not None:
             tip[[0, 2]], half[[0, 2]] = there.mean, there.half_width
-        x, z = np.asarray(self.law.target)
+        x, z = self.report.target
         miss = float(np.linalg.norm(tip - (x, self.depths[-1], z)))
         most = miss + float(half.max())
         words = ', '.join(

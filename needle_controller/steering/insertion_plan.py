@@ -10,12 +10,12 @@ from typing import Any, Final, NamedTuple
 
 from needle_controller.steering.planned_path import PlannedPath
 from needle_controller.steering.settings import SteeringPrior
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.display import Displayed
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.errors import ParameterError
-from needle_ros.files import read_document, write_whole
+from needle_ros.files import read_yaml, write_whole
 from needle_ros.settings import is_number
 import numpy as np
 import yaml
@@ -23,6 +23,8 @@ import yaml
 DIRECTIONS: Final = 16  #: Number of directions of the free space about a path.
 MOST_LAYERS: Final = 8  #: Most layers of tissue along a line.
 _FORMAT: Final = 1  #: Version of the file.
+#: Fields of a plan that are distances.
+_DISTANCES: Final = 'radius', 'bow', 'resolution'
 #: Constants of `SteeringParameters` with one value for each layer.
 _BY_LAYER: Final = 'bevel_load', 'cutting_force', 'coulomb_per_length', 'viscous_per_length'
 
@@ -143,36 +145,24 @@ def read_plan(path: Path | str) -> Plan:
     Returns
     -------
     Plan
-        The same plan; ParameterError if the file is not a plan.
+        The same plan; NeedleError if the file is not a plan.
 
     """
-    try:
-        document = read_document(Path(path).read_text(encoding='utf-8'))
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise ParameterError(f'plan {path} cannot be read: {reason}') from error
+    document = read_yaml(path)
     if not isinstance(document, dict) or document.get('plan') != _FORMAT:
         raise ParameterError(f'{path} is not a plan of format {_FORMAT}')
-    steps = _length_of(document.get('guide'))
+    guide = document.get('guide')
+    if not (isinstance(guide, list) and guide):
+        raise ParameterError(f'{path}: guide must be a list of setpoints x, z, got {guide!r}')
+    steps = len(guide)
     shapes = {
         'entry': (3,), 'direction': (3,), 'target': (3,), 'place': (3,), 'depths': (steps + 1,),
         'guide': (steps, 2), 'path': (steps + 1, 3), 'clearances': (steps + 1,),
     }  # fmt: skip
-    values: dict[str, Any] = {}
-    for item in fields(Plan):
-        value = document.get(item.name)
-        if item.name == 'layers':
-            value = _layers(f'{path}: layers', value)
-        elif item.name == 'free':
-            value = _free(f'{path}: free', value)
-        elif item.name in shapes:
-            value = _array(f'{path}: {item.name}', value, shapes[item.name])
-        elif item.name in ('needle', 'structure'):
-            if not isinstance(value, str):
-                raise ParameterError(f'{path}: {item.name} must be text, got {value!r}')
-        elif not is_number(value):
-            raise ParameterError(f'{path}: {item.name} must be a number, got {value!r}')
-        values[item.name] = value
+    values: dict[str, Any] = {
+        item.name: _value(f'{path}: {item.name}', item.name, document.get(item.name), shapes)
+        for item in fields(Plan)
+    }
     plan = Plan(**values)
     if plan.depths[0] != 0.0 or (np.diff(plan.depths) <= 0.0).any():
         raise ParameterError(f'{path}: depths must increase from 0 m')
@@ -181,14 +171,27 @@ def read_plan(path: Path | str) -> Plan:
     return plan
 
 
-def _length_of(value: object) -> int:
-    return len(value) if isinstance(value, list) else 0
+def _value(name: str, item: str, value: object, shapes: Mapping[str, tuple[int, ...]]) -> object:
+    if item == 'layers':
+        return _layers(name, value)
+    if item == 'free':
+        return _free(name, value)
+    if item in shapes:
+        return floats(name, value, shapes[item])
+    if item in ('needle', 'structure'):
+        if not isinstance(value, str):
+            raise ParameterError(f'{name} must be text, got {value!r}')
+    elif not is_number(value):
+        raise ParameterError(f'{name} must be a number, got {value!r}')
+    elif item in _DISTANCES and value < 0.0:
+        raise ParameterError(f'{name} must be >= 0 m, got {value!r}')
+    return value
 
 
 def _layers(name: str, value: object) -> FloatArray:
     if not value:
         return np.zeros((0, 3))
-    found = _array(name, value, (_length_of(value), 3))
+    found = floats(name, value, (None, 3))
     starts, stiffnesses, spreads = found.T
     if starts[0] != 0.0 or (np.diff(starts) <= 0.0).any():
         raise ParameterError(f'{name} must begin at 0 m and at increasing depths')
@@ -203,20 +206,9 @@ def _layers(name: str, value: object) -> FloatArray:
 def _free(name: str, value: object) -> FloatArray:
     if not value:
         return np.zeros((0, 1 + DIRECTIONS))
-    found = _array(name, value, (_length_of(value), 1 + DIRECTIONS))
+    found = floats(name, value, (None, 1 + DIRECTIONS))
     if (np.diff(found[:, 0]) <= 0.0).any() or (found < 0.0).any():
         raise ParameterError(f'{name} must be at increasing depths, with distances >= 0 m')
-    return found
-
-
-def _array(name: str, value: object, shape: tuple[int, ...]) -> FloatArray:
-    try:
-        found = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        found = np.empty(0)
-    if found.shape != shape or not np.isfinite(found).all() or 0 in shape:
-        size = ' x '.join(map(str, shape))
-        raise ParameterError(f'{name} must have {size} finite numbers')
     return found
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Status of a steered insertion: phase, law, expected tip and last measurement."""
 
+from math import isfinite, nan
 from typing import Final
 
 from needle_controller.steering.insertion import SteppedInsertion
@@ -9,7 +10,6 @@ from needle_ros.event_log import Severity
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.status import SteeringStatus
 from needle_ros.system_state import Mode
-import numpy as np
 
 #: Descriptions of the phases for the user.
 _DESCRIPTIONS: Final = {
@@ -34,24 +34,25 @@ def describe(
     """
     if insertion is None:
         return SteeringStatus()
-    guarded, law = insertion.law, insertion.law.law
+    guarded = insertion.law
+    report = guarded.report
     expected, measured = guarded.expected, guarded.measured
-    x, z = np.asarray(law.target).tolist()
+    x, z = report.target.tolist()
     _, guide_x, guide_z = goal[:3].tolist()
-    warning = law.warning if active else ''
+    warning = report.warning if active else ''
     if not warning and measured is not None and measured.error > _SCATTERED * noise:
         warning = (
             f'noise of the tip measurement is {1e3 * measured.error:.2f} mm, above the '
             f'configured {1e3 * noise:.2f} mm (prior.noise)'
         )
-    values = dict(law.status())
-    turns = values.pop('turns_left', None)
+    values = dict(report.status)
+    turns = values.pop('turns_left', nan)
     return SteeringStatus(
         target=(x, float(guarded.depths[-1]), z),
         step=min(guarded.step, guarded.steps),
         steps=guarded.steps,
         guide_setpoint=(guide_x, guide_z),
-        turns_left=None if turns is None else int(turns),
+        turns_left=int(turns) if isfinite(turns) else None,
         hit_probability=values.pop('hit_probability', None),
         bending_length_ratio=values.pop('bending_length_ratio', None),
         law=values,

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 from needle_controller.steering.planned_path import PlannedPath
 from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.settings import SteeringLimits
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_ros.errors import JobError, NeedleError, ParameterError, ShapeError
 from needle_ros.settings import find_class
@@ -200,10 +200,7 @@ def checked_tip(tip: ArrayLike | None, name: str = 'a tip measurement') -> Float
 
 def checked_target(target: ArrayLike) -> FloatArray:
     """Return a target x, z [m], if it is two finite numbers."""
-    found = checked_tip(target, 'target')
-    if not np.isfinite(found).all():
-        raise ParameterError(f'target must be finite, got {found.tolist()} m')
-    return found
+    return floats('target', target, (2,))
 
 
 class GuideLaw(ABC):

@@ -3,7 +3,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import ceil
 from typing import Final
 
 from needle_controller.steering.guarded_law import GuardedLaw
@@ -12,7 +11,12 @@ from needle_controller.steering.insertion_record import PlannedInsertion, Steeri
 from needle_controller.steering.law import build_law, SteeringLaw
 from needle_controller.steering.planning import Job, Progress, StartJob
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.settings import ContactSettings, ExecutiveSettings, SteeringPrior
+from needle_controller.steering.settings import (
+    ContactSettings,
+    ExecutiveSettings,
+    SteeringPrior,
+    step_depths,
+)
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
@@ -20,17 +24,7 @@ from needle_ros.errors import JobError, NeedleError, ParameterError
 import numpy as np
 
 _OUTSIDE: Final = 1e-3  #: Depth of a needle outside tissue, where the guide may move freely [m].
-_SAME: Final = 1e-6  #: Tolerance of equal numbers of steps.
-_MOST_STEPS: Final = 200  #: Most steps of a plan.
-
-
-def check_steps(steps: int, length: float, name: str) -> None:
-    """Raise `ParameterError` for more steps of a length [m], a setting, than are possible."""
-    if steps > _MOST_STEPS:
-        raise ParameterError(
-            f'it would take {steps} steps of {1e3 * length:g} mm, at most {_MOST_STEPS} are '
-            f'possible: increase {name}'
-        )
+_SAME: Final = 1e-6  #: Tolerance of equal depths and targets [m].
 
 
 @dataclass(slots=True, eq=False)
@@ -92,7 +86,7 @@ class InsertionPlanner:
             record.restore(law)
         except NeedleError as error:
             raise _cannot_resume(error, float(record.depths[0])) from error
-        if np.abs(np.subtract(law.law.target, (x, z))).max() > _SAME:
+        if np.abs(np.subtract(law.report.target, (x, z))).max() > _SAME:
             law.aim(np.array([x, z]))
 
     def _depths(self, request: PlannedInsertion, begun: float | None) -> FloatArray:
@@ -124,9 +118,7 @@ class InsertionPlanner:
             )
         if self.plan is not None:
             return self.plan.tip_path.since(depth).depths
-        steps = max(1, ceil((point[1] - depth) / settings.step_length - _SAME))
-        check_steps(steps, settings.step_length, 'step_length')
-        return np.linspace(depth, point[1], steps + 1)
+        return step_depths(point[1], settings.step_length, depth)
 
     def start(self, request: PlannedInsertion) -> None:
         settings, depths, record = self.settings, request.depths, request.record

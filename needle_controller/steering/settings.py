@@ -2,7 +2,7 @@
 """Settings of steering, as parameters: prior uncertainty, limits, steps of an insertion."""
 
 from dataclasses import dataclass, fields
-from math import inf, sqrt
+from math import ceil, inf, sqrt
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
@@ -20,10 +20,29 @@ from needle_ros.settings import (
 from needle_ros.system_state import RETRACT_DEPTH
 import numpy as np
 
+_MOST_STEPS: Final = 200  #: Most steps of an insertion.
 _PER_STEP: Final = 4.0  #: Least number of guide commands within a step.
 
 #: Joints that are moved; roll only if turns are allowed.
 JOINTS: Final = (INSERTION, GUIDE_X, GUIDE_Z, ROLL)
+
+
+def step_depths(
+    end: float, step: float, begin: float = 0.0, name: str = 'step_length'
+) -> FloatArray:
+    """
+    Return the depths of equal steps [m], each at most a step [m], shape (steps + 1,).
+
+    Raises `ParameterError` for more than 200 steps; ``name`` is that of the setting.
+    """
+    # A quotient of whole steps may be rounded up.
+    steps = max(1, ceil(min((end - begin) / step, 1e9) - 1e-6))
+    if steps > _MOST_STEPS:
+        raise ParameterError(
+            f'it would take {steps} steps of {1e3 * step:g} mm, at most {_MOST_STEPS} are '
+            f'possible: increase {name}'
+        )
+    return np.linspace(begin, end, steps + 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -41,11 +41,6 @@ class GroundTruth:
         return SteeringPlant(needle, depths, self.frame)
 
 
-def step_depths(depth: float, step: float) -> FloatArray:
-    """Return the depths of steps of about a length, from the skin to a depth [m]."""
-    return np.linspace(0.0, depth, max(1, round(depth / step)) + 1)
-
-
 def sample_truth(
     needle: NeedleParameters,
     steering: SteeringParameters,

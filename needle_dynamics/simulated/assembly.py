@@ -28,6 +28,7 @@ from needle_ros.settings import (
     check_whole,
     constant,
     from_values,
+    LARGEST_SEED,
     positive,
 )
 
@@ -71,8 +72,6 @@ class PlantSettings:
             raise ParameterError(f'modal must be numbers, got {self.modal!r}') from None
         object.__setattr__(self, 'modal', modal)
 
-
-LARGEST_SEED: Final = 2**62  #: largest seed of the noise; integer parameters have 64 bits
 
 #: Parameters by namespace, as settings with default values.
 SETTINGS: Final[Mapping[str, Any]] = {

@@ -9,7 +9,7 @@ from math import ceil, inf
 import os
 from typing import Final
 
-from needle_dynamics.arrays import FloatArray, IntArray
+from needle_dynamics.arrays import FloatArray, floats, IntArray
 from needle_dynamics.compiled import lanes
 from needle_dynamics.compiled.intervals import run
 from needle_dynamics.compiled.lane_rows import COLUMNS, Constants, LaneModes, LAYER, SECOND
@@ -22,7 +22,7 @@ from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
 from needle_dynamics.simulated.needle_array import columns_of, NeedleArray
-from needle_dynamics.simulated.trajectory import checked_tolerance, count_of, floats, refined
+from needle_dynamics.simulated.trajectory import checked_tolerance, count_of, refined
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -169,8 +169,6 @@ def simulate_batch(
             f'forces and torques must be constant or for {count} intervals, got states '
             f'{starts.shape}, forces {pushes.shape}, torques {turns.shape}'
         )
-    if not (np.isfinite(pushes).all() and np.isfinite(turns).all()):
-        raise ParameterError('forces and torques must be finite')
     if tolerance is not None and (step is not None or graded):
         raise ParameterError('tolerance excludes step and graded')
     tolerance = None if tolerance is None else checked_tolerance(tolerance)

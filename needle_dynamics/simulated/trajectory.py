@@ -7,7 +7,7 @@ from itertools import chain, count
 from math import inf, nan
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.compiled.friction import COULOMB, FRICTION_LAWS
 from needle_dynamics.compiled.intervals import advance_extrapolated, run, run_refined
 from needle_dynamics.compiled.step import Inputs
@@ -16,7 +16,7 @@ from needle_dynamics.errors import ToleranceError
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.integrator import checked_step, not_completed, SHORTEST_STEP
-from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -190,11 +190,7 @@ def simulate(
     count = count_of(duration, interval)
     time = np.arange(count + 1, dtype=np.float64) * interval
     pushes = [force(t) for t in time[:-1]] if callable(force) else np.full(count, force)
-    forces = floats('force', pushes)
-    if forces.shape != (count,) or not np.isfinite(forces).all():
-        raise ShapeError(
-            f'force must be one finite number at each of {count} times, got {force!r}'
-        )
+    forces = floats('force', pushes, (count,))
     model = NeedleModel(parameters)
     start = model.checked_state(state)
     if step is None:
@@ -278,14 +274,6 @@ def checked_tolerance(tolerance: float) -> float:
     if not 0.0 < tolerance < inf:
         raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
     return float(tolerance)
-
-
-def floats(name: str, values: object) -> FloatArray:
-    """Return a copy of the values as an array of floats; ``name`` is for the error message."""
-    try:
-        return np.array(values, dtype=float)
-    except (TypeError, ValueError):
-        raise ShapeError(f'{name} must be numbers, got {values!r}') from None
 
 
 def count_of(duration: float, interval: float) -> int:

@@ -4,12 +4,11 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.compiled.cut import insert, NO_FORCES
 from needle_dynamics.display import Progress, progress_of
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.batch import number_of_runs, thread_count
-from needle_dynamics.simulated.trajectory import floats
 from needle_dynamics.steering.needle import empty_cut, steered, wandering
 from needle_dynamics.steering.parameters import noise_cell, SteeringParameters
 from needle_ros.errors import ParameterError, ShapeError
@@ -134,8 +133,6 @@ def _poses(depths: ArrayLike, guides: ArrayLike, tilts: ArrayLike, rolls: ArrayL
         ('tilts', tilt, (k, 2)),
         ('rolls', roll, (k,)),
     ):
-        if not np.isfinite(values).all():
-            raise ParameterError(f'{name} must be finite')
         if values.shape != () and values.shape[-len(single) :] != single:
             several = f'(runs, {", ".join(map(str, single))})'
             raise ShapeError(f'{name} must have shape {single} or {several}, got {values.shape}')

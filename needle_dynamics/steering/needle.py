@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from math import ceil, exp, isfinite, sqrt
 from typing import Any, Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.compiled.beam import SpringSupports
 from needle_dynamics.compiled.cut import correlate, GuidePose, move_boxed, start
 from needle_dynamics.compiled.cutting_needle import (
@@ -32,7 +32,7 @@ from needle_dynamics.steering.parameters import (
     SteeringParameters,
     turning_load,
 )
-from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.errors import ParameterError
 from needle_ros.settings import is_number
 import numpy as np
 from numpy.typing import ArrayLike
@@ -257,7 +257,7 @@ class SteeredNeedle(Displayed):
         now = self._placement
         if guide is None and tilt is None and roll is None and tissue is None:
             return now
-        shift = now.tissue if tissue is None else _numbers('tissue', tissue, 3)
+        shift = now.tissue if tissue is None else floats('tissue', tissue, (3,))
         if self.steering.free_length + shift[1] < 0.0 or self.depth < shift[1]:
             raise ParameterError(f'tissue must stay between guide and tip, got {shift[1]:g} m')
         return Placement(
@@ -382,14 +382,5 @@ def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:
         x, z = values
         if isinstance(x, float) and isinstance(z, float) and isfinite(x) and isfinite(z):
             return x, z
-    x, z = _numbers(name, values, 2).tolist()
+    x, z = floats(name, values, (2,)).tolist()
     return x, z
-
-
-def _numbers(name: str, values: ArrayLike, count: int) -> FloatArray:
-    found = np.array(values, dtype=np.float64)
-    if found.shape != (count,):
-        raise ShapeError(f'{name} must have {count} numbers, got shape {found.shape}')
-    if not np.isfinite(found).all():
-        raise ParameterError(f'{name} must be finite, got {values!r}')
-    return found

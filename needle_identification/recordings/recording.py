@@ -9,7 +9,7 @@ from typing import Any, Final
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.display import Displayed
 from needle_ros.errors import ShapeError, shown
-from needle_ros.files import DocumentError, read_document
+from needle_ros.parameter_file import parameters_in
 from needle_ros.quantities import AXES
 import numpy as np
 
@@ -52,16 +52,7 @@ class BaseRecording(Displayed):
     @property
     def truth(self) -> Mapping[str, Any] | None:
         """Parameters of the recorded plant by name; None if there is no configuration."""
-        try:
-            document = read_document(self.configuration)
-        except DocumentError:
-            return None
-        if not isinstance(document, dict):
-            return None
-        for section in document.values():
-            if isinstance(section, dict) and isinstance(section.get('ros__parameters'), dict):
-                return dict(section['ros__parameters'])
-        return None
+        return parameters_in(self.configuration) or None
 
     @property
     def digest(self) -> bytes:

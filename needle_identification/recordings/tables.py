@@ -386,8 +386,9 @@ def _separator(line: str) -> str | None:
 
 def _split(line: str, separator: str | None) -> list[str]:
     line = line.strip()
-    quoted = separator and '"' in line
-    words = next(csv.reader([line], delimiter=separator)) if quoted else line.split(separator)
+    words = line.split(separator)
+    if separator and '"' in line:
+        words = next(csv.reader([line], delimiter=separator))
     return [word.strip().strip('"') for word in words]
 
 

@@ -128,13 +128,13 @@ def add_constants(parser: ArgumentParser, option: str, meaning: str) -> None:
     )
 
 
-def constants(words: Sequence[str]) -> dict[str, Any]:
+def constants(words: Sequence[str], option: str = '--set') -> dict[str, Any]:
     """Parse ``name=value`` words into values by name; a value is JSON or a plain word."""
     values: dict[str, Any] = {}
     for word in words:
         name, sign, text = word.partition('=')
         if not sign:
-            raise ParameterError(f'--set takes NAME=VALUE, got {word!r}')
+            raise ParameterError(f'{option} takes NAME=VALUE, got {word!r}')
         try:
             values[name] = json.loads(text)
         except json.JSONDecodeError:

@@ -21,7 +21,7 @@ from needle_planning.paths import SKIN_LIMIT
 from needle_planning.planner import find_plan
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import quantities
-from needle_ros.settings import check_whole
+from needle_ros.settings import check_whole, LARGEST_SEED
 import numpy as np
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def _simulation(options: argparse.Namespace) -> Callable[..., Chance] | None:
     from needle_planning.chance import chance_of, MOST_INSERTIONS, read_population
 
     check_whole('--insertions', options.insertions, 0, MOST_INSERTIONS)
-    check_whole('--seed', options.seed, 0, 2**32)
+    check_whole('--seed', options.seed, 0, LARGEST_SEED)
     if not options.radius > 0.0:
         raise ParameterError(f'--radius must be > 0 m, got {options.radius:g} m')
     given: dict[str, Any] = {}

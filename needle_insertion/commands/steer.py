@@ -11,8 +11,8 @@ from typing import Any, Final
 from needle_controller import OutOfReachError, SIMULATION_LIMITS, SteeringModel, SteeringPrior
 from needle_controller.steering import simulation
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, STEERING_LAWS
-from needle_controller.steering.planner import check_steps
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
+from needle_controller.steering.settings import step_depths
 import needle_dynamics as dynamics
 from needle_dynamics.needles import DIAMETERS, NeedlePreset
 from needle_dynamics.steering.needle import NeedlePath, NeedleShape
@@ -25,7 +25,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.files import write_whole
 from needle_ros.quantities import target as read_target
 from needle_ros.quantities import TARGET_HELP
-from needle_ros.settings import from_values
+from needle_ros.settings import check_whole, from_values, LARGEST_SEED
 from needle_study.scenario import check_names
 import numpy as np
 
@@ -101,8 +101,7 @@ def _target(options: argparse.Namespace, needle: NeedlePreset) -> dynamics.Float
             raise ParameterError(f'{options.output}: the picture must be .png')
         common.check_file(options.output)
     find_law(options.law)
-    if options.seed < 0:
-        raise ParameterError(f'--seed must be >= 0, got {options.seed}')
+    check_whole('--seed', options.seed, 0, LARGEST_SEED)
     target = np.array(read_target(' '.join(options.target)))
     reach = needle.needle.length - needle.steering.free_length
     if not 0.0 < target[1] <= reach:
@@ -137,13 +136,12 @@ def sample_needle(
 def run(options: argparse.Namespace) -> int:
     nominal = dynamics.find_needle(options.needle)
     target = _target(options, nominal)
-    check_steps(round(min(target[1] / options.step, 1e9)), options.step, '--step')
-    aim, depths = target[[0, 2]], simulation.step_depths(target[1], options.step)
+    depths, aim = step_depths(target[1], options.step, name='--step'), target[[0, 2]]
     changes = common.constants(options.set)
     check_names('', changes, (*CONSTANTS, *DIAMETERS))
     needle, steering, _ = nominal.changed(changes)
-    prior = from_values(SteeringPrior, common.constants(options.prior))
-    errors = from_values(simulation.SteppedTipErrors, common.constants(options.sensor))
+    prior = from_values(SteeringPrior, common.constants(options.prior, '--prior'))
+    errors = from_values(simulation.SteppedTipErrors, common.constants(options.sensor, '--sensor'))
     limits = replace(
         SIMULATION_LIMITS,
         guide_limit=options.limit,

@@ -22,11 +22,11 @@ from needle_ros import contract
 from needle_ros.base_node import LATCHED
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.network import DOMAIN
+from needle_ros.parameter_file import parameters_in
 from needle_ros.settings import from_values
 from needle_ros.wire import JOINT_STATE, WRENCH
 from rclpy.node import Node
 from std_msgs.msg import String
-import yaml
 
 #: Folder of the parameter files, below the prefix of pip or colcon.
 _SHARE: Final = Path('share/needle_insertion/config')
@@ -171,8 +171,7 @@ def _robot(graph: Graph, node: Node) -> Robot | None:
     topic = contract.CONFIGURATION.name.replace('~', 'controller')
     latest = graph.latest(node, String, topic, LATCHED)
     graph.spin_until(lambda: latest.message, topic, _START)
-    (document,) = yaml.safe_load(latest.message.data).values()
-    values, prefix = document['ros__parameters'], 'hardware.'
+    values, prefix = parameters_in(latest.message.data), 'hardware.'
     own = {item.name: values[f'{prefix}{item.name}'] for item in fields(HardwareSettings)}
     # The controller has found the topics of their type.
     for name, field in ((JOINT_STATE, 'state_topic'), (WRENCH, 'wrench_topic')):

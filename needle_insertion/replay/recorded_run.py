@@ -24,7 +24,7 @@ from needle_identification.bags.messages import deserialize
 from needle_identification.bags.topics import BagTopic
 from needle_ros.contract import TIP_DEFLECTION, TOPICS
 from needle_ros.errors import MessageError, ParameterError
-from needle_ros.files import DocumentError, read_document
+from needle_ros.parameter_file import parameters_by_node
 from needle_ros.timing import NANOSECONDS, nanoseconds, seconds
 from needle_ros.wire import MessageReader, TYPES
 import numpy as np
@@ -81,15 +81,13 @@ def recorded_runs(path: Path) -> list[RecordedRun]:
 
 
 def _configurations(messages: _Messages) -> list[tuple[int, dict[str, Any]]]:
-    found = []
-    for received, message in messages:
-        # Skip other texts, and other nodes.
-        with suppress(DocumentError, AttributeError, KeyError, TypeError):
-            for node in read_document(message.data).values():
-                values = node['ros__parameters']
-                if 'mode' in values and 'sensor.force_noise' in values:
-                    found.append((received, values))
-    return found
+    # Other nodes are skipped.
+    return [
+        (received, values)
+        for received, message in messages
+        for values in parameters_by_node(message.data).values()
+        if 'mode' in values and 'sensor.force_noise' in values
+    ]
 
 
 def _events(messages: _Messages) -> list[tuple[int, int, Event]]:

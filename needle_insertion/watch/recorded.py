@@ -17,18 +17,11 @@ from needle_identification.bags.messages import deserialize
 from needle_identification.bags.topics import BagTopic
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.samples import are_gaps
-from needle_insertion.watch.view import (
-    CONFIGURED,
-    EFFORT,
-    parameters_of,
-    RATE,
-    Signal,
-    signal_of,
-    SIGNALS,
-    View,
-)
+from needle_insertion.watch.view import CONFIGURED, EFFORT, RATE, Signal, signal_of, SIGNALS, View
 from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
+from needle_ros.parameter_file import parameters_in
+from needle_ros.settings import is_number
 from needle_ros.status import node_of
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader, read_line, read_string
@@ -218,7 +211,7 @@ class ShownRecording:
                 effect = partial(View.status, status=status, now=time)
                 self._keep((name, node_of(status.name)), time, effect)
         else:
-            parameters = parameters_of(read_string(data))
+            parameters = parameters_in(read_string(data))
             self._keep((name, ''), time, lambda view: view.configuration(name, parameters))
 
     def _keep(
@@ -317,7 +310,7 @@ class PagePlayback:
         """Process a message ``at`` (a time [s]), ``play`` or ``speed``."""
         now = self.at
         match message:
-            case {'at': int() | float() as at, **rest} if not rest and at is not True:
+            case {'at': at, **rest} if not rest and is_number(at):
                 self._at = min(max(0.0, float(at)), self._duration)
             case {'play': bool() as play, **rest} if not rest:
                 if play and now >= self._duration:

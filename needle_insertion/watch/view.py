@@ -9,7 +9,6 @@ from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics import FloatArray
 from needle_ros import contract
 from needle_ros.errors import printable
-from needle_ros.files import DocumentError, read_document
 from needle_ros.settings import is_number
 from needle_ros.status import ControllerStatus, node_of, NodeStatus, read_status, SteeringStatus
 from needle_ros.wire import Reading
@@ -38,16 +37,6 @@ _NODES: Final = 64
 _NORMAL: Final = 1.96  #: half width of a 95 % interval, in standard deviations
 
 _Place = Sequence[float | None]  #: Coordinates [m], None if unknown.
-
-
-def parameters_of(text: str) -> dict[str, Any]:
-    """Return the parameters in a configuration (parameter file of one node); {} if invalid."""
-    try:
-        document = read_document(text)
-        (content,) = document.values()
-        return {str(name): value for name, value in content['ros__parameters'].items()}
-    except (DocumentError, AttributeError, KeyError, TypeError, ValueError):
-        return {}
 
 
 def scene(configurations: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -14,11 +14,12 @@ from typing import Any, Final
 from needle_insertion.graph.messages import waiting
 from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_insertion.watch.recorded import STREAMS
-from needle_insertion.watch.view import CONFIGURED, parameters_of, View
+from needle_insertion.watch.view import CONFIGURED, View
 from needle_ros import contract
 from needle_ros.contract import Qos, Topic
 from needle_ros.errors import JobError, MessageError
 from needle_ros.network import domain_of, stay_local
+from needle_ros.parameter_file import parameters_in
 from needle_ros.wire import MessageReader, read_line, read_string
 from rclpy.context import Context
 from rclpy.experimental.events_executor import EventsExecutor
@@ -76,7 +77,7 @@ class WatchNode(Node):
         self._takers.append((waiting(self, topic, qos, raw=raw), take))
 
     def _configured(self, node: str, data: bytes, _now: float) -> None:
-        self._view.configuration(node, parameters_of(read_string(data)))
+        self._view.configuration(node, parameters_in(read_string(data)))
 
     def _on_diagnostics(self, array: Any, now: float) -> None:
         for status in array.status:

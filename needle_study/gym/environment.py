@@ -11,10 +11,10 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from needle_dynamics import FloatArray
-from needle_dynamics.arrays import BoolArray
-from needle_dynamics.simulated.trajectory import floats
+from needle_dynamics.arrays import BoolArray, floats
 from needle_ros.errors import ParameterError, ShapeError
 from needle_ros.settings import check_choice
+from needle_study.scenario import check_names
 import numpy as np
 
 _WIDTH, _HEIGHT, _MARGIN = 320, 120, 20  #: size of an image and depth 0 [pixels]
@@ -27,6 +27,8 @@ _SPOT: Final = 3  #: half of the size of the target [pixels]
 
 _ONE: Final = np.ones(1, dtype=bool)  #: mask of a single environment
 
+_MASK: Final = 'reset_mask'  #: option of a vector environment
+
 _NO_EPISODE: Final = 'the episode is over, or none has begun: call reset'
 
 
@@ -34,12 +36,7 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
     """Return actions as floats clipped to [-1, 1]; they must be finite and have the shape."""
     if isinstance(actions, np.ndarray) and actions.dtype.kind not in 'fiub':
         raise ShapeError(f'actions must be real numbers, got an array of {actions.dtype}')
-    found = floats('actions', actions)
-    if found.shape != shape:
-        raise ShapeError(f'actions must have shape {shape}, got {found.shape}')
-    if not np.isfinite(found).all():
-        raise ParameterError(f'actions must be finite, got {found[~np.isfinite(found)][0]}')
-    return found.clip(-1.0, 1.0)
+    return floats('actions', actions, shape).clip(-1.0, 1.0)
 
 
 def picture(length: float, deflection: float, tip: Any, target: Any) -> Any:
@@ -74,6 +71,10 @@ class Needles(Protocol):
 
     action_space: spaces.Box  #: of one needle
     observation_space: spaces.Box
+
+    @property
+    def options(self) -> Sequence[str]:
+        """Names of the options of `reset` for a single environment."""
 
     def begin(
         self, which: BoolArray, rngs: Sequence[np.random.Generator], options: Mapping[str, Any]
@@ -110,7 +111,9 @@ class NeedleEnv(gymnasium.Env[FloatArray, FloatArray]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
         super().reset(seed=seed, options=options)
-        self._needles.begin(_ONE, [self.np_random], options or {})
+        given = options or {}
+        check_names('options: ', given, self._needles.options)
+        self._needles.begin(_ONE, [self.np_random], given)
         self._running = True
         return self._needles.observe()[0], self._info(np.zeros(1))
 
@@ -185,7 +188,9 @@ class NeedleVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
             seeds = list(seed)
         elif seed is not None:
             seeds = [int(seed) + k for k in range(self.num_envs)]
-        which = np.array((options or {}).get('reset_mask', [True] * self.num_envs), dtype=bool)
+        given = options or {}
+        check_names('options: ', given, [_MASK])
+        which = np.array(given.get(_MASK, [True] * self.num_envs), dtype=bool)
         if len(seeds) != self.num_envs or which.shape != (self.num_envs,):
             raise ParameterError(
                 f'seed and reset_mask must be of {self.num_envs} environments, got {len(seeds)} '

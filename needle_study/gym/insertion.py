@@ -25,6 +25,8 @@ _EDGE: Final = 2e-3  #: lateral position at the upper edge of an image [m]
 
 
 class _Needles:
+    options = ()
+
     def __init__(self, needle: str, spread: float, number: int) -> None:
         if not 0.0 <= spread <= 1.0:
             raise ParameterError(f'spread must be in [0, 1], got {spread!r}')

@@ -10,7 +10,8 @@ from typing import Any, ClassVar, Final
 from gymnasium import spaces
 from needle_controller import SIMULATION_LIMITS, SteeringPrior
 from needle_controller.steering.law import checked_target
-from needle_controller.steering.simulation import GroundTruth, step_depths
+from needle_controller.steering.settings import step_depths
+from needle_controller.steering.simulation import GroundTruth
 from needle_dynamics import (
     DEFAULT_NEEDLE,
     find_needle,
@@ -44,6 +45,8 @@ _FPS: Final = {'render_fps': 2}
 
 
 class _Needles:
+    options = 'truth', 'target'
+
     def __init__(
         self,
         needle: str,

@@ -12,7 +12,8 @@ from benchmarks.policies import EXPERT, returns
 import gymnasium
 from gymnasium.utils.env_checker import check_env
 from needle_controller import GuideSetpoint, SIMULATION_LIMITS, SteeringPrior
-from needle_controller.steering.simulation import GroundTruth, step_depths
+from needle_controller.steering.settings import step_depths
+from needle_controller.steering.simulation import GroundTruth
 from needle_dynamics import (
     DEFAULT_NEEDLE,
     find_needle,
@@ -192,7 +193,7 @@ def test_next_episode_has_the_population_again() -> None:
     action = np.ones(2)
     assert np.array_equal(environment.step(action)[0], other.step(action)[0])
     for target in ((1.0, 2.0, 3.0), (np.nan, 0.0)):
-        with pytest.raises((ParameterError, ShapeError), match='target must be'):
+        with pytest.raises((ParameterError, ShapeError), match='target must (have shape|be finite)'):
             environment.reset(options={'target': target})
 
 
@@ -399,6 +400,19 @@ def test_position_that_is_not_finite_does_not_move_the_guide() -> None:
     after, *_ = environment.step(np.zeros(2))
     assert after[0] == pytest.approx(0.05)
     assert seen[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ('made', 'option', 'valid'),
+    [
+        (SteeringEnv, 'traget', "did you mean 'target'"),
+        (InsertionEnv, 'target', 'valid: none'),
+        (lambda: SteeringVectorEnv(2), 'target', 'valid: reset_mask'),
+    ],
+)
+def test_unknown_options_of_reset_are_rejected(made: Any, option: str, valid: str) -> None:
+    with pytest.raises(ParameterError, match=f"options: unknown parameter '{option}'; {valid}"):
+        made().reset(options={option: [0.0, 0.0]})
 
 
 @pytest.mark.parametrize(

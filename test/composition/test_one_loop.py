@@ -9,7 +9,8 @@ from math import inf
 from typing import Any
 
 from needle_controller import MultiHypothesisLaw, SIMULATION_LIMITS, SteeringModel, SteeringPrior
-from needle_controller.steering.simulation import GroundTruth, step_depths
+from needle_controller.steering.settings import step_depths
+from needle_controller.steering.simulation import GroundTruth
 from needle_dynamics import FloatArray
 from needle_insertion.cli import main
 from needle_insertion.commands.steer import sample_needle

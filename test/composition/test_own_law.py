@@ -139,6 +139,30 @@ def test_fault_of_a_law_stops_the_insertion(plan: Any, fault: str) -> None:
     assert np.abs(np.array(robot.tracked)[:, 1:]).max() < 2e-3
 
 
+@pytest.mark.requirement('S-135')
+@pytest.mark.parametrize(
+    ('member', 'value', 'fault'),
+    [
+        ('status', lambda law: {'gain': 1.0 / (2 - law.step)}, 'ZeroDivisionError'),
+        ('status', lambda law: {'gain': 'high' if law.step > 1 else 1.0}, 'ValueError'),
+        ('warning', property(lambda law: 1 / (2 - law.step)), 'ZeroDivisionError'),
+        (
+            'target', property(lambda law: np.zeros(2 + (law.step > 1)), lambda _, __: None),
+            'the target of a law must be x and z, got shape (3,)',
+        ),
+    ],
+)  # fmt: skip
+def test_failed_report_of_a_law_stops_the_insertion(
+    monkeypatch: pytest.MonkeyPatch, member: str, value: Any, fault: str
+) -> None:
+    """Its members fail with its calls, not when the node publishes its status."""
+    FaultyLaw.plans = lambda _: GuideSetpoint(0.0, 0.0)
+    monkeypatch.setattr(FaultyLaw, member, value, raising=False)
+    robot = Robot(law=f'{__name__}:FaultyLaw')
+    robot.steer()
+    assert fault in robot.loop.fault
+
+
 @pytest.mark.parametrize('law', ['springs', 'open_loop'])
 @pytest.mark.parametrize(
     ('sees', 'fault'),

@@ -33,7 +33,7 @@ from needle_study.distribution import Distribution, distribution, KINDS
 from needle_study.engine import chunk, compute, dask, order, Results
 from needle_study.steering import SteeringScenario
 from needle_study.study import build_study, read_study, Study
-from needle_study.summary import column, indices, probability, quantile, worst
+from needle_study.summary import column, indices, NOISE, probability, quantile, worst
 import numpy as np
 import pytest
 from scipy import stats
@@ -602,6 +602,13 @@ def test_variance_fractions_of_a_sum_are_exact() -> None:
     assert indices(y[:199], {'a': columns['a'][:199]}, study) == {}
 
 
+def test_values_without_variance_have_no_cause() -> None:
+    study = build_study({**small('saltelli'), 'samples': 400})
+    found = indices(np.zeros(400), {}, study)
+    assert NOISE in found
+    assert {value for one in found.values() for value in (*one.first[:3], *one.total[:3])} == {0.0}
+
+
 def test_worst_samples_do_not_depend_on_batches() -> None:
     y = np.random.default_rng(2).standard_normal(20_000)
     y[::100] = np.nan
@@ -764,7 +771,7 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'correlations': [['skin', 'tilt_z', 1]]}, 'value between -1 and 1'),
         ({'correlations': [['skin', 'tilt_z', 0.5], ['tilt_z', 'skin', 0.1]]}, 'skin twice'),
         ({'settings': {'depth': 0.3}}, 'settings.depth must be <='),
-        ({'settings': {'step_length': 1e-9}}, 'depth over step_length must be <= 1000 steps'),
+        ({'settings': {'step_length': 1e-9}}, 'increase settings.step_length'),
         ({'settings': {'turns': 0.7}}, 'settings.turns must be a whole number, got 0.7'),
         ({'settings': {'guide_limit': 0}}, 'law multi_hypothesis with guide_limit 0'),
         ({'settings': {'guide_limit': 0, 'law': 'broyden'}}, 'law broyden with'),
@@ -779,7 +786,9 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'settings': {'needle': [1]}}, 'needle must be one of'),
         ({'settings': {'law': [1]}}, 'law must be one of multi_hypothesis'),
         ({'settings': {'constants': 1}}, 'settings: constants must be names with values, got 1'),
-        ({'settings': {'constants': {1: 1}}}, "unknown parameter '1'"),
+        ({'settings': {'constants': {1: 1}}}, "settings.constants: unknown parameter '1'"),
+        ({'settings': {'constants': {'tissue_stifness': 3e4}}}, "mean 'tissue_stiffness'?"),
+        ({'seed': 2**63}, f'seed must be an integer from 0 to {2**62}, got {2**63}'),
         ({'settings': {'prior': 1}}, 'settings: prior must be names with values, got 1'),
         ({'settings': {'prior': {'nose': 1}}}, "unknown parameter 'settings.prior.nose'"),
         ({'settings': 1}, 'settings must be names with values, got 1'),
@@ -804,13 +813,28 @@ def test_invalid_studies_are_rejected(
     check_refused({**SMALL, **change}, complaint, tmp_path, capsys)
 
 
+@pytest.mark.parametrize(
+    ('text', 'complaint'),
+    [
+        ('a,b\n1,2,3\n', "a.csv has no column 'skin', it has a, b"),
+        (f'skin\n"{"1" * 200_000}"\n', 'a.csv cannot be read: field larger than'),
+    ],
+)
+def test_invalid_tables_are_rejected(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, complaint: str
+) -> None:
+    (tmp_path / 'a.csv').write_text(text)
+    change = {'population': {'skin': {'table': ['a.csv', 'skin']}}}
+    check_refused({**SMALL, **change}, complaint, tmp_path, capsys)
+
+
 def test_unusable_files_and_folders_are_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / 'study.yaml'
     file.write_text(yaml.safe_dump(SMALL))
     assert main(['study', str(tmp_path / 'none.yaml')]) == 2
-    assert 'none.yaml: No such file' in capsys.readouterr().err
+    assert 'none.yaml cannot be read: No such file' in capsys.readouterr().err
     (tmp_path / 'other' / 'results').mkdir(parents=True)
     assert main(['study', str(file), '-o', str(tmp_path / 'other')]) == 2
     assert 'exists and is not a study; name another folder' in capsys.readouterr().err

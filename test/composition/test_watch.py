@@ -29,9 +29,10 @@ from needle_insertion.watch import recorded
 from needle_insertion.watch.live import Live, LiveReader, RecordedReader
 from needle_insertion.watch.recorded import PagePlayback, ShownRecording
 from needle_insertion.watch.server import LONGEST, MOST_READERS, Server
-from needle_insertion.watch.view import parameters_of, scene, SIGNALS, View
+from needle_insertion.watch.view import scene, SIGNALS, View
 from needle_ros import contract
 from needle_ros.errors import JobError, MessageError, ParameterError
+from needle_ros.parameter_file import parameters_in
 from needle_ros.status import ControllerStatus, SteeringStatus
 from needle_ros.wire import read_line, Reading
 import numpy as np
@@ -65,7 +66,7 @@ def numbers(*values: float) -> Reading:
 def told(view: View, *names: str) -> None:
     """Store the configurations of nodes in a view."""
     for name in names:
-        view.configuration(name, parameters_of(CONFIGURATIONS[name]))
+        view.configuration(name, parameters_in(CONFIGURATIONS[name]))
 
 
 # Frames.
@@ -212,7 +213,7 @@ def test_predicted_tip_has_95_percent_interval() -> None:
 
 def test_tissue_and_limits_follow_from_configurations() -> None:
     """Layers, membranes and free length of the plant; limits and depths of the controller."""
-    found = scene({name: parameters_of(text) for name, text in CONFIGURATIONS.items()})
+    found = scene({name: parameters_in(text) for name, text in CONFIGURATIONS.items()})
     assert found == {
         'tissue': {
             'of': 'plant', 'length': 0.2, 'free': 0.04,
@@ -244,7 +245,7 @@ def test_invalid_number_of_a_configuration_is_left_out(value: object) -> None:
 def test_invalid_configuration_is_ignored(text: str) -> None:
     """It is counted as an unreadable message."""
     view = View()
-    view.configuration('plant', parameters_of(text))
+    view.configuration('plant', parameters_in(text))
     assert view.scene['tissue'] is None
     assert view.frame(0.0)['invalid'] == 1
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from needle_dynamics import Integrator, NeedleError, NeedleModel, NeedleParameters, ShapeError
+from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -102,9 +103,10 @@ def test_base_reaction_matches_the_mean_of_the_integrator(
 
 def test_invalid_accelerations_are_rejected() -> None:
     model = NeedleModel(NeedleParameters())
-    for wanted in (np.zeros(3), [0.0, np.nan, 0.0, 0.0]):
-        with pytest.raises(ShapeError, match='acceleration must be finite with shape'):
-            model.inverse_dynamics(model.state_at(0.1), wanted)
+    with pytest.raises(ShapeError, match=r'acceleration must have shape \(4,\), got \(3,\)'):
+        model.inverse_dynamics(model.state_at(0.1), np.zeros(3))
+    with pytest.raises(ParameterError, match='acceleration must be finite, got nan'):
+        model.inverse_dynamics(model.state_at(0.1), [0.0, np.nan, 0.0, 0.0])
 
 
 def test_holding_force_is_the_excess_over_friction() -> None:

@@ -15,6 +15,7 @@ from needle_dynamics import (
     NeedleParameters,
     ShapeError,
 )
+from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -274,7 +275,7 @@ def test_non_finite_states_are_rejected(slot: int, value: float) -> None:
     of = model()
     state = of.state_at(0.05)
     state[slot] = value
-    with pytest.raises(ShapeError, match='must be finite'):
+    with pytest.raises(ParameterError, match='state must be finite'):
         of.acceleration(state)
 
 

@@ -88,7 +88,7 @@ def test_parameter_file_of_nodes_is_a_needle(tmp_path: Path) -> None:
         ('inner_diameter: 1mm\n', 'must be 0 <= inner < outer [m], got 0.0 and'),
         ('outer_diameter: 1mm\narea: 1mm^2\n', 'area is given by the diameters, too'),
         ('outer_diamter: 1mm\n', "did you mean 'outer_diameter'"),
-        ('a: [', 'mine.yaml cannot be read: is not YAML'),
+        ('a: [', 'mine.yaml is not YAML'),
     ],
 )
 def test_errors_of_a_file_name_the_file(tmp_path: Path, text: str, complaint: str) -> None:

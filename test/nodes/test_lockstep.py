@@ -23,8 +23,8 @@ from needle_controller import (
     SteeringPrior,
 )
 from needle_controller.steering.law import build_law, DEFAULT_LAW
-from needle_controller.steering.settings import SteeringLimits
-from needle_controller.steering.simulation import sample_truth, simulate_steering, step_depths
+from needle_controller.steering.settings import SteeringLimits, step_depths
+from needle_controller.steering.simulation import sample_truth, simulate_steering
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters, NEEDLES
 from needle_identification import Bag
 from needle_identification.bags.bag import read_topic

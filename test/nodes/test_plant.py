@@ -777,6 +777,20 @@ def test_friction_may_change_during_motion(ros_graph: RosGraph) -> None:
     bench.until(lambda: 'model.coulomb_friction: 2.06' in configurations[-1].data, 'configuration')
 
 
+def test_rejected_change_leaves_the_plant_unchanged(ros_graph: RosGraph) -> None:
+    """Also the friction of a change whose fault is invalid."""
+    bench = Bench(ros_graph)
+    friction = bench.plant._run.constants.model.coulomb_friction
+    changed = bench.plant.set_parameters_atomically(
+        [
+            Parameter('model.coulomb_friction', value=friction + 1.0),
+            Parameter('fault.kind', value='bad luck'),
+        ]
+    )
+    assert not changed.successful
+    assert bench.plant._run.constants.model.coulomb_friction == friction
+
+
 def test_controller_friction_may_change_if_gains_stay_stable(ros_graph: RosGraph) -> None:
     """The check is the same as at the start; a rejection keeps the value and gives the reason."""
     node = ros_graph.add(ControllerNode, parameters={**RATE, 'law': 'pid'})

@@ -102,7 +102,7 @@ def test_invalid_labels_are_rejected_in_one_line(text: str, reason: str, tmp_pat
     path = written(tmp_path, text)
     with pytest.raises(ParameterError, match=reason) as error:
         read_labels(path)
-    assert str(error.value).startswith(f'{path}: ')
+    assert str(error.value).startswith(str(path))
     assert '\n' not in str(error.value)
 
 
@@ -111,7 +111,7 @@ def test_unreadable_labels_are_rejected(content: bytes | None, tmp_path: Path) -
     path = tmp_path / 'labels.yaml'
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(ParameterError, match=r'No such file|it is not text'):
+    with pytest.raises(ParameterError, match=r'No such file|is not text'):
         read_labels(path)
 
 
@@ -124,7 +124,7 @@ def test_long_labels_are_rejected_before_they_are_read(tmp_path: Path) -> None:
     path = tmp_path / 'labels.yaml'
     with path.open('wb') as stream:
         stream.truncate(2**33)
-    with pytest.raises(ParameterError, match='has 1048577 characters, at most 1048576 are read'):
+    with pytest.raises(ParameterError, match='has more than 1048576 characters'):
         read_labels(path)
 
 

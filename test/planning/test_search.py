@@ -394,7 +394,7 @@ def cases() -> dict[str, tuple[dict[str, Any], str]]:
     return {
         'target outside': ({'target': (0.5, 0.0, 0.0)}, 'is outside the image'),
         'target in bone': ({'target': (0.0, 0.0, 0.048)}, 'the target is in bone'),
-        'no number': ({'target': (np.nan, 0.0, 0.0)}, '3 finite coordinates'),
+        'no number': ({'target': (np.nan, 0.0, 0.0)}, 'target must be finite, got nan'),
         'unknown entry': ({'entry': 'air'}, "entry must be one of bone, skin, got 'air'"),
         'entry at the target': ({'entry': TARGET}, 'further from the target'),
         'disc': ({'entry': (0.0, 0.0, 0.1), 'entry_radius': -1.0}, 'entry_radius must be >= 0'),
@@ -499,13 +499,13 @@ def test_free_space_is_free_to_its_edge(shift: int) -> None:
         ('needle: bending_35mm', 'needle: 3', 'needle must be text, got 3'),
         ('roll: 0.0', 'roll: right', "roll must be a number, got 'right'"),
         ('roll: 0.0', '', 'roll must be a number, got None'),
-        ('entry: [', 'entry: [1.0, ', 'entry must have 3 finite numbers'),
-        ('target: [', 'target: [.nan, 0, 0]\nother: [', 'target must have 3 finite numbers'),
-        ('depths: [', 'depths: [0.0, ', 'depths must have .* finite numbers'),
-        ('guide:', 'guides:', 'must have .* finite numbers'),
+        ('entry: [', 'entry: [1.0, ', r'entry must have shape \(3,\), got \(4,\)'),
+        ('target: [', 'target: [.nan, 0, 0]\nother: [', 'target must be finite, got nan'),
+        ('depths: [', 'depths: [0.0, ', 'depths must have shape'),
+        ('guide:', 'guides:', 'guide must be a list of setpoints x, z, got None'),
         ('depths: [0.0', 'depths: [1.0', 'depths must increase from 0 m'),
-        ('frame:', '\tframe:', 'cannot be read: is not YAML'),
-        ('free:', 'free: [[0.1, 1.0]]\nspace:', 'free must have 1 x 17 finite numbers'),
+        ('frame:', '\tframe:', r'plan\.yaml is not YAML'),
+        ('free:', 'free: [[0.1, 1.0]]\nspace:', r'free must have shape \(n, 17\), got \(1, 2\)'),
         ('free:', f'free: [{[0.1] + [-1.0] * 16}]\nspace:', 'free must be at increasing depths'),
     ],
 )
@@ -517,7 +517,7 @@ def test_damaged_plan_is_rejected_by_a_line(
     text = file.read_text()
     assert old in text
     file.write_text(text.replace(old, new, 1))
-    with pytest.raises(ParameterError, match=message):
+    with pytest.raises(NeedleError, match=message):
         read_plan(file)
     with pytest.raises(ParameterError, match='cannot be read: No such file'):
         read_plan(tmp_path / 'none.yaml')
