@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
-from math import ceil, expm1, inf, isfinite
+from math import ceil, expm1, inf
 from typing import Any, Final
 
 from needle_dynamics.compiled.tissue import Layers
@@ -130,11 +130,11 @@ class NeedleParameters:
     )
     carriage_mass: float = constant(0.0, 'kg', 'mass that moves with the needle base')
     tissue_stiffness: float = constant(520.0, 'N/m^2', 'tissue stiffness k_a per length')
-    layer_depths: tuple[float, ...] = field(
-        default=(), metadata={'description': 'depths at which further tissue layers begin [m]'}
+    layer_depths: tuple[float, ...] = constant(
+        (), 'm', 'depths at which further tissue layers begin'
     )
-    layer_stiffnesses: tuple[float, ...] = field(
-        default=(), metadata={'description': 'stiffness of each of these layers [N/m^2]'}
+    layer_stiffnesses: tuple[float, ...] = constant(
+        (), 'N/m^2', 'stiffness of each of these layers'
     )
     swelling: float = constant(
         0.0, '1', 'final relative change of the tissue stiffness by swelling',
@@ -165,7 +165,7 @@ class NeedleParameters:
     def __post_init__(self) -> None:
         check_constants(self)
         for item in fields(self):
-            if 'unit' in item.metadata:
+            if 'unit' in item.metadata and not isinstance(item.default, tuple):
                 # An integer would cause compiled functions to be compiled for another type.
                 object.__setattr__(self, item.name, float(getattr(self, item.name)))
         if self.minimum_depth >= self.length:
@@ -176,18 +176,6 @@ class NeedleParameters:
         self._check_modes()
 
     def _check_layers(self) -> None:
-        for name in ('layer_depths', 'layer_stiffnesses'):
-            try:
-                if isinstance(getattr(self, name), (str, Mapping)):
-                    raise TypeError
-                values = tuple(float(value) for value in getattr(self, name))
-            except (TypeError, ValueError):
-                raise ParameterError(
-                    f'{name} must be a list of numbers, got {getattr(self, name)!r}'
-                ) from None
-            if not all(isfinite(value) and value >= 0.0 for value in values):
-                raise ParameterError(f'{name} must be finite and >= 0, got {list(values)}')
-            object.__setattr__(self, name, values)
         depths = (0.0, *self.layer_depths)
         if len(self.layer_depths) != len(self.layer_stiffnesses):
             raise ParameterError(

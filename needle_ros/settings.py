@@ -2,8 +2,8 @@
 """Settings: frozen dataclasses whose fields have a unit, a description and a range."""
 
 from array import array
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import field, fields
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import Field, field, fields
 from difflib import get_close_matches
 from importlib import import_module
 from math import inf, isfinite
@@ -79,17 +79,34 @@ def same_field(settings: type, name: str) -> Any:
 
 
 def check_constants(values: object) -> None:
-    """Check every field of a dataclass that is declared by a function of this module."""
+    """Check every field of a dataclass that is declared here; numbers of an array are a tuple."""
     for item in fields(values):  # type: ignore[arg-type]
         value, meta = getattr(values, item.name), item.metadata
         if 'unit' in meta:
-            several = isinstance(item.default, tuple) and isinstance(value, tuple)
-            for number in value if several else (value,):
+            several = isinstance(item.default, tuple)
+            if not several or (_may_be_single(item) and isinstance(value, (int, float))):
+                _check_number(item.name, value, meta)
+                continue
+            listed = _listed(item.name, value)
+            for number in listed:
                 _check_number(item.name, number, meta)
+            object.__setattr__(values, item.name, tuple(map(float, listed)))
         elif 'valid' in meta:
             check_choice(item.name, value, meta['valid'])
         elif 'type' in meta and not isinstance(value, meta['type']):
             raise ParameterError(f'{item.name} must be {_NAMES[meta["type"]]}, got {value!r}')
+
+
+def _may_be_single(item: Field[Any]) -> bool:
+    return 'float |' in str(item.type)
+
+
+def _listed(name: str, value: Any) -> Sequence[Any]:
+    # Also of an array.
+    found = value.tolist() if hasattr(value, 'tolist') else value
+    if not isinstance(found, (tuple, list)):
+        raise ParameterError(f'{name} must be a list of numbers, got {value!r}')
+    return found
 
 
 class CheckedSettings:
@@ -197,7 +214,7 @@ def from_values(
         taken = tuple(value or ()) if several and isinstance(value, _LISTS) else value
         if 'unit' in item.metadata:
             taken = _as_number(f'{prefix}{name}', taken, item.metadata['unit'])
-            only_tuple = several and 'float |' not in str(item.type)
+            only_tuple = several and not _may_be_single(item)
             taken = (taken,) if only_tuple and isinstance(taken, float) else taken
         given[name] = taken
     try:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of the observer: assumed sensor noise and model uncertainty."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
-from math import nan
 from typing import Final
 
 from needle_controller.compiled.filter import LowPass, Noise
@@ -104,12 +103,10 @@ class ObserverSettings:
     offset_time: float = positive(1000.0, 's', 'correlation time of these offsets')
     force_resolution: float = constant(_of_sensor('resolution', 2), 'N', 'force per count')
     torque_resolution: float = constant(_of_sensor('resolution', 3), 'N m', 'torque per count')
-    cutoffs: tuple[float, ...] = field(
-        default=_SENSOR.cutoffs,
-        metadata={
-            'description': 'low-pass filters of the wrench in series '
-            '(Butterworth, second order) [Hz]'
-        },
+    cutoffs: tuple[float, ...] = constant(
+        _SENSOR.cutoffs,
+        'Hz',
+        'low-pass filters of the wrench in series (Butterworth, second order)',
     )
     filter_rate: float = positive(
         _SENSOR.rate, 'Hz', 'sample rate of these filters, with means over the samples as input'
@@ -121,17 +118,12 @@ class ObserverSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
-        try:
-            cutoffs = tuple(float(value) for value in self.cutoffs)
-        except (TypeError, ValueError):
-            cutoffs = (nan,)
         low, high = _SLOWEST * self.filter_rate, 0.5 * self.filter_rate
-        if not all(low <= value < high for value in cutoffs):
+        if not all(low <= value < high for value in self.cutoffs):
             raise ParameterError(
                 f'cutoffs must be in [{low:g}, {high:g}) Hz each, at filter_rate = '
                 f'{self.filter_rate:g} Hz, got {self.cutoffs!r}'
             )
-        object.__setattr__(self, 'cutoffs', cutoffs)
 
     @property
     def sensor_noise(self) -> dict[str, tuple[float, ...]]:

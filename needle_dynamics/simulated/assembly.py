@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
 from needle_dynamics.model import NeedleModel
@@ -49,8 +49,8 @@ class PlantSettings:
     )  # fmt: skip
     depth: float = positive(0.02, 'm', 'initial insertion depth')
     tip_deflection: float = constant(0.0, 'm', 'initial tip deflection', low=-0.1, high=0.1)
-    modal: tuple[float, ...] = field(
-        default=(), metadata={'description': 'initial q1 to qn [m^3/2], instead of tip_deflection'}
+    modal: tuple[float, ...] = constant(
+        (), 'm^3/2', 'initial q1 to qn, instead of tip_deflection', low=-1.0, high=1.0
     )
     step: float = constant(2e-5, 's', 'longest step of the integrator', low=1e-7, high=1e-2)
     command_timeout: float = positive(0.1, 's', 'age at which a command expires')
@@ -66,11 +66,6 @@ class PlantSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
-        try:
-            modal = tuple(float(value) for value in self.modal)
-        except (TypeError, ValueError):
-            raise ParameterError(f'modal must be numbers, got {self.modal!r}') from None
-        object.__setattr__(self, 'modal', modal)
 
 
 #: Parameters by namespace, as settings with default values.

@@ -3,12 +3,11 @@
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from math import isfinite
 from typing import Final
 
 from needle_identification.estimation import ESTIMATORS
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_choice, check_constants, choice, flag, positive
+from needle_ros.settings import check_choice, check_constants, choice, constant, flag, positive
 
 #: Terms of the friction force, by name; their equations are in `terms`.
 TERMS: Final = (
@@ -39,11 +38,8 @@ class FrictionSettings:
     )
     stribeck_speed: float = positive(1e-3, 'm/s', 'speed over which the breakaway friction decays')
     decay_time: float = positive(10.0, 's', 'time constant of the term decay')
-    layers: tuple[float, ...] = field(
-        default=(),
-        metadata={
-            'description': 'insertion depths at which layers begin, for the term layers [m]'
-        },
+    layers: tuple[float, ...] = constant(
+        (), 'm', 'insertion depths at which layers begin, for the term layers', low=-10.0
     )
     reversals: bool = flag(
         False, 'use the samples at reversals, too, if friction is known to change its sign at once'
@@ -61,11 +57,8 @@ class FrictionSettings:
     def __post_init__(self) -> None:
         check_constants(self)
         object.__setattr__(self, 'terms', tuple(self.terms))
-        object.__setattr__(self, 'layers', tuple(map(float, self.layers)))
-        if not all(map(isfinite, self.layers)) or any(
-            low >= high for low, high in pairwise(self.layers)
-        ):
-            raise ParameterError(f'layers must be finite and increase, got {list(self.layers)}')
+        if any(low >= high for low, high in pairwise(self.layers)):
+            raise ParameterError(f'layers must increase, got {list(self.layers)}')
         if bool(self.layers) != ('layers' in self.terms):
             raise ParameterError(
                 f'the term layers and the setting layers need each other, got the terms '

@@ -26,7 +26,7 @@ from needle_dynamics.compiled.lane_rows import LANES
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.steering.needle import wandering
 from needle_dynamics.steering.parameters import with_lengths
-from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.errors import NeedleError, ParameterError, ShapeError
 from needle_study.gym.insertion import DRAWN, InsertionEnv, InsertionVectorEnv, SPREAD, TARGETS
 from needle_study.gym.pushed import FORCE, PERIOD, START, STEP
 from needle_study.gym.steering import PRIOR, SteeringEnv, SteeringVectorEnv
@@ -193,7 +193,7 @@ def test_next_episode_has_the_population_again() -> None:
     action = np.ones(2)
     assert np.array_equal(environment.step(action)[0], other.step(action)[0])
     for target in ((1.0, 2.0, 3.0), (np.nan, 0.0)):
-        with pytest.raises((ParameterError, ShapeError), match='target must (have shape|be finite)'):
+        with pytest.raises(NeedleError, match='target must'):
             environment.reset(options={'target': target})
 
 
