@@ -9,6 +9,7 @@ from needle_controller.laws.law import Axis
 from needle_ros.timing import NANOSECONDS
 
 _LONGEST: Final = 2.0  #: Longest step, in periods: missing samples are not made up for.
+_CLOSE: Final = 0.1  #: Distance of a command from a robot that has followed it, as a part of lead.
 
 
 class Admittance:
@@ -23,6 +24,9 @@ class Admittance:
     ``period`` is the sample period [s], ``speed`` the largest speed of the base [m/s],
     ``lead`` the largest distance of the command from the measurement [m], ``depths`` the least and
     largest insertion depth to command [m], and ``delay`` the delay of the law [samples].
+
+    A base at rest moves no needle that something else has moved: it restarts at the measured depth
+    of a needle that is less deep, or deeper by more than ``lead``.
     """
 
     def __init__(
@@ -41,15 +45,23 @@ class Admittance:
         #: Commanded insertion depth [m]; None before the first step.
         self.position: float | None = None
         self.velocity = 0.0  #: Velocity of the base [m/s].
-        self.measured = 0.0  #: Last measured insertion depth [m].
+        self._ahead = lead  #: Least distance of the command from a robot that is less deep [m].
+        self._yields = False  #: Whether the base has given way since its last motion.
         self.answered: int | None = None  #: Stamp of the last step [ns]; None at rest.
         #: States of the last steps; the first one is by the delay of the law before now.
         self._states = deque[BaseState](maxlen=delay + 1)
 
     def state(self, measured: float) -> BaseState:
         """Return the state for the law, at a measured depth [m]."""
-        rest = measured if self.position is None else self._near(self.position, measured)
-        return self._states[0] if self._states else BaseState(rest, 0.0)
+        return self._states[0] if self._states else BaseState(self._rest(measured), 0.0)
+
+    def _rest(self, measured: float) -> float:
+        """Return where the base rests, at a measured depth [m]."""
+        if self.position is None:
+            return measured
+        ahead, close = self.position - measured, _CLOSE * self._lead
+        stays = -self._lead - close <= ahead <= self._ahead + close
+        return self.position if stays else measured
 
     def _near(self, position: float, measured: float) -> float:
         return min(max(position, measured - self._lead), measured + self._lead)
@@ -60,14 +72,16 @@ class Admittance:
 
         Takes the measured depth [m] and its stamp [ns]; a repeated stamp changes nothing.
         """
-        before = measured if self.position is None else self.position
+        before = self.position
+        if before is None or self.answered is None:
+            before = self._rest(measured)
         if not self._states:
             self._states.append(BaseState(before, self.velocity))
         elapsed = self._period
         if self.answered is not None:
             longest = _LONGEST * self._period
             elapsed = min(max((stamp - self.answered) / NANOSECONDS, 0.0), longest)
-        self.answered, self.measured = stamp, measured
+        self.answered, self._ahead, self._yields = stamp, self._lead, False
         most = self._speed
         aim, velocity = self.axis.propagate(before, self.velocity, force, elapsed)
         velocity = min(max(velocity, -most), most)
@@ -77,18 +91,31 @@ class Admittance:
         near = self._near(within, measured)
         self.velocity = velocity if near == aim else 0.0
         self.position = near
-        self._states.append(BaseState(near, self.velocity, waits=near != within))
+        behind = abs(near - measured) > _CLOSE * self._lead
+        self._states.append(BaseState(near, self.velocity, near != within, behind))
         return near
 
-    def hold(self) -> float | None:
-        """Stop the base at once; return the last commanded depth [m], or None."""
+    def place(self, position: float) -> None:
+        """Command a depth [m] at once, within ``lead`` of the measured one."""
+        self.position, self._ahead = position, self._lead
+
+    def hold(self, measured: float | None) -> float | None:
+        """
+        Stop the base at once, at a measured depth [m]; return the depth to command.
+
+        Returns None before the first step, and if the depth is not known.
+        """
         self.velocity, self.answered = 0.0, None
         self._states.clear()
+        if self.position is None or measured is None:
+            return None
+        self.position = self._rest(measured)
+        self._ahead = min(self._ahead, max(self.position - measured, 0.0))
         return self.position
 
-    def give_way(self) -> float | None:
+    def give_way(self, measured: float | None) -> float | None:
         """Stop the base where it no longer pushes; see `hold`."""
-        if self.position is not None:
+        if self.position is not None and measured is not None and not self._yields:
             # Of a withdrawing needle the measured depth is the deeper one.
-            self.position = min(self.measured, self.position)
-        return self.hold()
+            self.position, self._yields = min(measured, self.position), True
+        return self.hold(measured)

@@ -92,6 +92,7 @@ class BaseState(NamedTuple):
     depth: float  #: insertion depth [m]
     velocity: float  #: velocity [m/s]
     waits: bool = False  #: whether it waits for the robot that follows it
+    behind: bool = False  #: whether the robot has not come to it
 
 
 class Measurement(NamedTuple):
@@ -107,9 +108,9 @@ class Measurement(NamedTuple):
     base: BaseState | None = None  #: state that the law controls, if it is not the measured one
 
     @property
-    def waits(self) -> bool:
-        """Whether the command waits for a robot that follows positions."""
-        return self.base is not None and self.base.waits
+    def behind(self) -> bool | None:
+        """Whether a robot that follows positions is behind its command; None for others."""
+        return None if self.base is None else self.base.behind
 
     @classmethod
     def from_reading(cls, reading: Reading) -> Measurement:

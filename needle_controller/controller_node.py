@@ -298,11 +298,12 @@ class ControllerNode(ModelNode):
 
     def deactivate(self) -> None:
         """Command zero force, and discard the motion and its target."""
-        answer = self._supervisor.deactivate(self.now())
-        self._act(answer)
+        now = self.now()
+        answer = self._supervisor.deactivate(now)
+        self._act(answer, now)
         for _ in range(_AGAIN if self._driver is not None else 0):
             sleep(_PAUSE)
-            self._act(answer)
+            self._act(answer, now)
         self.destroy_timer(self._watchdog)
 
     # Inputs.
@@ -368,7 +369,7 @@ class ControllerNode(ModelNode):
 
     # Outputs.
 
-    def _act(self, answer: ForceCommand | None) -> None:
+    def _act(self, answer: ForceCommand | None, now: int | None = None) -> None:
         if answer is not None and self._command is not None:
             stamp, force, torque, reference, error = answer
             driver, supervisor = self._driver, self._supervisor
@@ -376,7 +377,8 @@ class ControllerNode(ModelNode):
                 message = self._write_wrench(stamp, 0.0, force, 0.0, torque, 0.0, 0.0)
             else:
                 stopped = supervisor.safety.stop is not None
-                message = driver.message(answer, supervisor.bending.load, stopped=stopped)
+                depth = supervisor.depth(self.now() if now is None else now)
+                message = driver.message(answer, depth, supervisor.bending.load, stopped=stopped)
             if message is not None:
                 self._command(message)
             if reference:

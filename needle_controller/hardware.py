@@ -179,12 +179,11 @@ class Robot:
         """Discard all measurements and commands."""
         self.estimates = False  #: Whether velocities are estimated.
         self._speed = _Speed()
-        self._depth = nan  #: Last measured insertion depth [m].
         #: Positions of the other joints of a command to hold, in the unit of the robot.
         self._others: dict[str, float] = {}
         if self._base is not None:
-            self._base.hold()
             self._base.position = None
+            self._base.hold(None)
 
     def configure(self, controller: Controller) -> None:
         """Take the nominal model and limits of a controller, for position commands."""
@@ -247,8 +246,6 @@ class Robot:
                 j = names.index(ROTATION)
                 if j < min(len(positions), len(velocities)):
                     angle, angular_velocity = positions[j], velocities[j]
-        if isfinite(depth):
-            self._depth = depth
         base = None
         if self._base is not None and settings.command == POSITION and isfinite(depth):
             base = self._base.state(depth)
@@ -279,33 +276,44 @@ class Robot:
     # To the robot.
 
     def command(
-        self, answer: ForceCommand, load: float = 0.0, *, stopped: bool = False
+        self,
+        answer: ForceCommand,
+        depth: float | None,
+        load: float = 0.0,
+        *,
+        stopped: bool = False,
     ) -> list[float] | None:
         """
-        Return efforts or positions in the units of the robot; None if there is no position yet.
+        Return efforts or positions in the units of the robot; None for no command.
 
-        ``load`` is the load against insertion that the force must overcome [N]. With ``stopped``,
-        a latched stop, the position command is the last measured position.
+        ``depth`` is the measured insertion depth [m], None if it is not known: then a robot that
+        follows positions gets none, and stays where it is. ``load`` is the load against insertion
+        that the force must overcome [N]. With ``stopped``, a latched stop, the position command is
+        where the robot was measured.
         """
         settings = self.settings
         if settings.command == EFFORT:
             effort = self._gain * answer.force
             return [effort if joint == settings.joint else 0.0 for joint in settings.joints]
         base, length = self._base, None
-        if base is not None and isfinite(self._depth):
+        if base is not None:
             # Without a reference no motion is requested, except for a repeated message.
             if stopped:
-                length = base.give_way()
+                length = base.give_way(depth)
+            elif depth is None:
+                # The other joints may be elsewhere, too.
+                self._others.clear()
+                length = base.hold(None)
             elif answer.reference and self.probe is not None:
                 if isfinite(self.probe):
-                    base.position, base.measured = self.probe, self._depth
-                    length = base.hold()
+                    base.place(self.probe)
+                    length = base.hold(depth)
             elif answer.reference:
-                length = base.step(answer.force - load, self._depth, answer.stamp)
+                length = base.step(answer.force - load, depth, answer.stamp)
             elif base.answered == answer.stamp:
                 length = base.position
             else:
-                length = base.hold()
+                length = base.hold(depth)
         if length is None:
             return None
         own = length / self._gain + settings.zero

@@ -221,13 +221,15 @@ class Driver:
         whole, part = divmod(round(controller.period * NANOSECONDS), NANOSECONDS)
         self._period = Duration(sec=whole, nanosec=part)
 
-    def message(self, answer: ForceCommand, load: float, *, stopped: bool) -> Any:
+    def message(
+        self, answer: ForceCommand, depth: float | None, load: float, *, stopped: bool
+    ) -> Any:
         """Return the message for a command, see `Robot.command`, or None."""
         settings, stamp = self._settings, answer.stamp
         kind, joints = settings.command_type, list(settings.joints)
         if kind == 'wrench':
             return self._write_wrench(stamp, 0.0, answer.force, 0.0, answer.torque, 0.0, 0.0)
-        values = self.robot.command(answer, load, stopped=stopped)
+        values = self.robot.command(answer, depth, load, stopped=stopped)
         if values is None:
             return None
         if kind == 'float64_multi_array':

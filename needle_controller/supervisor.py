@@ -44,15 +44,13 @@ class Supervisor(StateMachine[ForceCommand]):
         super().__init__(steady, {})
         self.receive(targets=True)
         self.safety = Safety(SafetyLimits(), ControllerSettings(), NeedleParameters())
-        #: Insertion depth of `retract` [m].
-        self.retract_depth = 0.0
+        self.retract_depth = 0.0  #: Insertion depth of `retract` [m].
         self.fault, self._kind = '', FaultKind.WAITING
         self._timing = TimingMonitor()
         self._robot: Robot | None = None
         self._last = ForceCommand(0)
         self._answered: tuple[int, int] | None = None  #: Stamp and time of a sample for `finish`.
-        #: Last measured insertion depth [m].
-        self._depth: float | None = None
+        self._depth: float | None = None  #: Last valid insertion depth [m].
         #: The controller while configured, and while measurements are answered.
         self.controller: Controller | None = None
         self._active: Controller | None = None
@@ -102,6 +100,10 @@ class Supervisor(StateMachine[ForceCommand]):
             self._following.change(parameters)
 
     @property
+    def _joints(self) -> InputMonitor:
+        return self.safety.streams['joint_states']
+
+    @property
     def waits(self) -> bool:
         """Whether no measurement was received yet."""
         return bool(self.fault) and self._kind is FaultKind.WAITING
@@ -138,7 +140,7 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def _check_clock(self, now: int) -> ForceCommand | None:
         """Command zero force and discard measurements and requests if the clock was set back."""
-        if not (back := self.clock_went_back(now, self.safety.streams['joint_states'].timeout)):
+        if not (back := self.clock_went_back(now, self._joints.timeout)):
             return None
         self._begin(now)
         return self._release_for(f'clock went back by {back:.3f} s', now, FaultKind.CLOCK)
@@ -189,19 +191,17 @@ class Supervisor(StateMachine[ForceCommand]):
     def _request(
         self, topic: Topic, stamp: int, frame: str, now: int, act: RequestAction
     ) -> ForceCommand | None:
-        """Execute a request if it is new and valid, and acknowledge it."""
         answer = self._check_clock(now) if self._active is not None else None
         if not self._is_new(topic, stamp, frame, now):
             return answer
         # Valid from the first sample after its stamp on, in any order of arrival.
         request = self._waiting.add(topic, stamp, (INSERTION,), act)
-        since = last if (last := self.safety.streams['joint_states'].last) >= 0 else now
+        since = last if (last := self._joints.last) >= 0 else now
         waits = self._active is not None and self.safety.stop is None
         self._execute_request((since if waits else stamp) + 1, request.elapsed(since))
         return answer
 
     def _execute_request(self, stamp: int, elapsed: float = 0.0) -> None:
-        """Execute a request that was sent before a stamp [ns], if any, and acknowledge it."""
         if (request := self._waiting.take(stamp)) is None:
             return
         if self.authority.mode is Mode.RETRACTING and not self._targets:
@@ -245,7 +245,6 @@ class Supervisor(StateMachine[ForceCommand]):
         return None
 
     def _stop(self, reason: str, now: int) -> ForceCommand:
-        """Latch a stop: zero force, and no motion until the next request."""
         self.safety.latch(reason)
         self._waiting.end(f'stopped: {reason}')
         self.bending.forget()
@@ -326,7 +325,7 @@ class Supervisor(StateMachine[ForceCommand]):
             return None
         stamp, answer = reading.stamp, self._check_clock(now)
         self.finish()
-        refusal = self.safety.streams['joint_states'].check(stamp, now)
+        refusal = self._joints.check(stamp, now)
         if refusal is not None:
             if refusal.kind == REPEATED:
                 return self._again(stamp)
@@ -339,6 +338,7 @@ class Supervisor(StateMachine[ForceCommand]):
             self._origin = stamp if self._origin < 0 else self._origin
             measured = convert(Reading(stamp - self._origin, *reading[1:]))
         except ParameterError as error:
+            self._depth = None
             return self._release_for(str(error), stamp)
         if measured.is_finite():
             self._stop_for(self.safety.guard.encoders(measured), stamp)
@@ -370,7 +370,6 @@ class Supervisor(StateMachine[ForceCommand]):
         self._warn('doubt', self.bending.warning)
 
     def _again(self, stamp: int) -> ForceCommand:
-        """Repeat the last command if it answered this stamp, else command zero force."""
         if self._last.stamp == stamp:
             return ForceCommand(stamp, self._last.force, self._last.torque)
         return self._command(ForceCommand(stamp))
@@ -400,7 +399,7 @@ class Supervisor(StateMachine[ForceCommand]):
         forces = self._last.force, measured.force, self.bending.load
         following, depth = self._following, measured.depth
         step = error[0] if controller.guide.steps else None
-        lost = following.update(stamp, depth, aim.velocity, *forces, step, measured.waits)
+        lost = following.update(stamp, depth, aim.velocity, *forces, step, measured.behind)
         receded = controller.guide.receded(depth, aim.velocity)
         fault = safety.guard.tracking(error[0], receded) or following.fault
         if (stopped := self._stop_for(fault, stamp)) is not None:
@@ -421,25 +420,22 @@ class Supervisor(StateMachine[ForceCommand]):
         """Check for missing inputs, and for duplicate publishers of commands and measurements."""
         answer, safety = self._check_clock(now), self.safety
         safety.count_publishers(publishers)
-        joints = safety.streams['joint_states']
-        timeout, silence = joints.timeout / NANOSECONDS, joints.silence(now)
         if safety.duplicate_publishers is not None:
             answer = self._release_for(safety.duplicate_publishers, now, FaultKind.PUBLISHERS)
-        elif silence > timeout:
-            line = f'joint_states is stale: none received for {silence:.3f} s'
+        elif not self._joints.is_current(now):
+            line = f'joint_states is stale: none received for {self._joints.silence(now):.3f} s'
             answer = self._release_for(line, now)
         answer = self._stop_for(safety.mixed_sources(now), now) or answer
-        if safety.streams['ground_truth'].silence(now) > timeout:
+        if not safety.streams['ground_truth'].is_current(now):
             self.bending.load = 0.0
         for name, line in safety.new_warnings(now).items():
             self._warn(name, f'{line}; the observer continues without it')
         if safety.limits.sensors_required:
             answer = self._stop_for(safety.warning(now), now) or answer
-        self._warn('pace', self._timing.compare_rate(joints))
+        self._warn('pace', self._timing.compare_rate(self._joints))
         return answer
 
     def _stop_for(self, reason: str | None, stamp: int) -> ForceCommand | None:
-        """Stop the system, if there is a reason and no stop yet."""
         if reason is None or self.authority.reason:
             return None
         self.authority.stop(reason)
@@ -467,6 +463,11 @@ class Supervisor(StateMachine[ForceCommand]):
     def _command(self, answer: ForceCommand) -> ForceCommand:
         self._last = answer
         return answer
+
+    def depth(self, now: int) -> float | None:
+        """Return the measured insertion depth [m]; None if it is old, or of several robots."""
+        single = self.safety.duplicate_publishers is None
+        return self._depth if single and self._joints.is_current(now) else None
 
     @property
     def _phase(self) -> ControllerPhase:

@@ -137,6 +137,10 @@ class InputMonitor:
         """Return the time since the last valid message [s]; zero before the first."""
         return (now - self.counted) / NANOSECONDS if self.counted is not None else 0.0
 
+    def is_current(self, now: int) -> bool:
+        """Return whether the last valid message is not older than the timeout."""
+        return self.silence(now) * NANOSECONDS <= self.timeout
+
     def status(self, now: int) -> InputStatus:
         counted = (ACCEPTED, REPEATED, DROPPED)
         return InputStatus(

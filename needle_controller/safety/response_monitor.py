@@ -182,7 +182,7 @@ class ResponseMonitor:
         reported: float,
         load: float = 0.0,
         step: float | None = None,
-        waits: bool = False,
+        behind: bool | None = None,
     ) -> bool:
         """
         Process a measurement at a stamp [ns]; return whether the plant does not follow.
@@ -190,16 +190,18 @@ class ResponseMonitor:
         Takes insertion depth [m], velocity of the reference [m/s], also while it waits, the last
         commanded and the reported force [N], NaN if there is none, the known load against the
         force [N], the distance [m] to a reference that steps: it rests while the needle moves, and
-        whether the command waits for a robot that follows positions.
+        whether a robot that follows positions is behind its command, None for another robot. With
+        positions the force is virtual: at rest it moves nothing.
         """
         applied = commanded if isnan(reported) else reported
         self.fault = None
-        if step is not None and abs(step) <= self._stall.most:
+        rests = rate == 0.0 and behind is not None
+        if rests or (step is not None and abs(step) <= self._stall.most):
             self._stall.forget()
         else:
             # Far from a step, the needle must move as behind a moving reference.
             self.fault = self._stall.update(stamp, depth, step or rate, applied, load)
-        self.fault = self.fault or self._check_robot(stamp, depth, waits)
+        self.fault = self.fault or self._check_robot(stamp, depth, behind=bool(behind))
         self.lost = self._is_lost(stamp, depth, rate, commanded, reported)
         self.notice = self._stall.notice
         if self.lost:
@@ -209,10 +211,10 @@ class ResponseMonitor:
             )
         return self.lost
 
-    def _check_robot(self, stamp: int, depth: float, waits: bool) -> str | None:
+    def _check_robot(self, stamp: int, depth: float, *, behind: bool) -> str | None:
         """Return why a robot that is behind its position command is blocked, or None."""
         moved = 0.0 if self._behind is None else abs(depth - self._behind.depth)
-        if not waits:
+        if not behind:
             self._behind = None
         elif self._behind is None or moved > _NOTHING * self._stall.most:
             self._behind = _Mark(stamp, depth)

@@ -297,7 +297,7 @@ class Safety:
     def obstacle(self, now: int) -> str | None:
         for stream in self.streams.values():
             # Readings from before the silence are outdated.
-            if stream.silence(now) * NANOSECONDS > stream.timeout:
+            if not stream.is_current(now):
                 self.guard.forget(stream.name)
         required = self.warning(now) if self.limits.sensors_required else None
         return self.guard.violated or required

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from needle_controller import Axis, Controller, ControllerSettings, Measurement
 from needle_controller.admittance import Admittance
 from needle_dynamics import NeedleParameters
+import numpy as np
 import pytest
 
 PERIOD = 2e-3
@@ -96,15 +97,15 @@ def test_base_outside_the_range_does_not_jump() -> None:
 def test_hold_and_give_way_stop_the_base() -> None:
     """At its last position, or at the measured position; a repeated stamp moves nothing."""
     base = base_of(lead=1e-3)
-    assert base.hold() is None
-    assert base.give_way() is None
+    assert base.hold(0.02) is None
+    assert base.give_way(0.02) is None
     for k in range(50):
         last = base.step(10.0, 0.02, k * STEP)
     assert last == pytest.approx(0.021)
     assert base.step(10.0, 0.02, base.answered or 0) == last
-    assert base.hold() == last
+    assert base.hold(0.02) == last
     assert base.velocity == 0.0
-    assert base.give_way() == 0.02
+    assert base.give_way(0.02) == 0.02
 
 
 @given(st.floats(-20.0, 20.0), st.floats(-1e-3, 1e-3))
@@ -115,9 +116,51 @@ def test_base_gives_way_out_of_the_tissue_only(force: float, lag: float) -> None
         base.step(force, 0.02 + lag, k * STEP)
     position = base.position
     assert position is not None
-    found = base.give_way()
+    found = base.give_way(0.02 + lag)
     assert found is not None
     assert found <= min(position, 0.02 + lag)
+
+
+LEAD = 1e-3
+CLOSE = 0.1 * LEAD
+
+
+@pytest.mark.requirement('S-325')
+@given(
+    force=st.floats(-15.0, 15.0),
+    lag=st.floats(-LEAD, LEAD),
+    moved=st.lists(st.floats(-0.05, 0.05), max_size=20),
+    yields=st.booleans(),
+)
+def test_base_at_rest_moves_no_needle_that_was_moved(
+    force: float, lag: float, moved: list[float], yields: bool
+) -> None:
+    """The command is not deeper than the needle, except where the robot had not come to it."""
+    base = base_of(lead=LEAD)
+    for k in range(20):
+        base.step(force, 0.02 + lag, k * STEP)
+    stop = base.give_way if yields else base.hold
+    ahead = LEAD
+    for measured in (0.02 + lag, *(0.02 + lag + one for one in moved)):
+        command = stop(measured)
+        assert command is not None
+        assert -LEAD - CLOSE - 1e-12 <= command - measured <= ahead + CLOSE + 1e-12
+        ahead = min(ahead, max(command - measured, 0.0))
+    # The next motion begins there.
+    assert base.state(measured).depth == command
+    assert abs(base.step(0.0, measured, 10**12) - command) < 1e-12
+
+
+def test_noise_does_not_move_a_base_at_rest() -> None:
+    """Noise of the encoders is less than the distance of a needle that was moved."""
+    base = base_of(lead=LEAD)
+    for k in range(50):
+        base.step(10.0, 0.02, k * STEP)
+    last = base.hold(0.02)
+    assert last is not None
+    rng = np.random.default_rng(1)
+    noise = rng.uniform(-0.5 * CLOSE, 0.5 * CLOSE, 10_000)
+    assert {base.hold(last + float(one)) for one in noise} == {last}
 
 
 def drive(

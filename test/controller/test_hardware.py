@@ -80,7 +80,7 @@ def test_position_commands_invert_measurements(robot: Robot, position: float) ->
                                   zero=settings.zero))  # fmt: skip
     sent.configure(Controller(NeedleParameters.preset('phantom')))
     sent.measurement(state(['insertion'], [position], [0.0]))
-    assert sent.command(push(SECOND, 0.0)) == pytest.approx([position], abs=1e-9)
+    assert sent.command(push(SECOND, 0.0), length) == pytest.approx([position], abs=1e-9)
 
 
 @given(robot=ROBOTS, force=NUMBERS, velocity=NUMBERS)
@@ -90,7 +90,7 @@ def test_power_is_preserved(robot: Robot, force: float, velocity: float) -> None
     measured = robot.measurement(state(['insertion'], [0.0], [velocity]))
     told = forces(sign=settings.sign, scale=settings.scale, zero=settings.zero)
     # Products and quotients of three factors: a few roundings of 1e-16.
-    (effort,) = told.command(ForceCommand(0, force)) or [nan]
+    (effort,) = told.command(ForceCommand(0, force), None) or [nan]
     assert effort * velocity == pytest.approx(force * measured.velocity, rel=1e-12, abs=1e-12)
     assert told.force(effort) == pytest.approx(force, rel=1e-12, abs=1e-12)
     read = robot.measurement(state(['insertion'], [0.0], [velocity], [effort]))
@@ -208,40 +208,44 @@ def test_dynamic_joint_state_is_converted() -> None:
 def test_other_joints_get_zero_effort() -> None:
     """In the order of command_joints."""
     robot = forces(joint='slide', command_joints=('a', 'slide', 'b'), sign=-1.0)
-    assert robot.command(ForceCommand(0, 3.0)) == [0.0, -3.0, 0.0]
+    assert robot.command(ForceCommand(0, 3.0), None) == [0.0, -3.0, 0.0]
 
 
 def test_other_joints_hold_their_position() -> None:
     """The position of the first measurement, until the next activation."""
     robot = moves(joint='slide', command_joints=('a', 'slide'))
-    assert robot.command(push(SECOND)) is None
+    assert robot.command(push(SECOND), None) is None
     robot.measurement(state(['slide', 'a'], [0.02, 1.0], [0.0, 0.0]))
     robot.measurement(state(['slide', 'a'], [0.02, 1.5], [0.0, 0.0]))
-    first, second = robot.command(push(SECOND)) or [nan, nan]
+    first, second = robot.command(push(SECOND), 0.02) or [nan, nan]
     assert first == 1.0
     assert 0.02 < second < 0.0201
     robot.begin()
-    assert robot.command(push(SECOND)) is None
+    assert robot.command(push(SECOND), None) is None
     robot.measurement(state(['slide', 'a'], [0.03, 2.0], [0.0, 0.0]))
-    assert robot.command(push(SECOND, 0.0)) == [2.0, 0.03]
+    assert robot.command(push(SECOND, 0.0), 0.03) == [2.0, 0.03]
 
 
 @pytest.mark.requirement('S-114')
 def test_position_command_rests_without_a_reference() -> None:
-    """It holds the last command in a fault, and yields to the robot in a stop."""
+    """It holds the last command in a fault, and yields to the robot in a stop.
+
+    Without a known depth there is none: the robot may be anywhere.
+    """
     robot = moves(scale=1e-3)
     for k in range(1, 100):
         stamp = SECOND + k * 1_000_000
         robot.measurement(state(['insertion'], [20.0], [0.0], stamp=stamp))
-        (last,) = robot.command(push(stamp)) or [nan]
+        (last,) = robot.command(push(stamp), 0.02) or [nan]
     assert last == pytest.approx(22.0)
     # A repeated measurement does not stop the motion.
-    assert robot.command(ForceCommand(stamp, 10.0)) == [last]
-    assert robot.command(ForceCommand(stamp + 1)) == [last]
+    assert robot.command(ForceCommand(stamp, 10.0), 0.02) == [last]
+    assert robot.command(ForceCommand(stamp + 1), 0.02) == [last]
     # Implausible measurements do not change the command.
     robot.measurement(state(['insertion'], [1e9], [0.0], stamp=stamp + 2))
-    assert robot.command(ForceCommand(stamp + 2), stopped=True) == pytest.approx([20.0])
-    assert robot.command(ForceCommand(stamp + 3), stopped=True) == pytest.approx([20.0])
+    assert robot.command(ForceCommand(stamp + 2), None, stopped=True) is None
+    assert robot.command(ForceCommand(stamp + 3), 0.02, stopped=True) == pytest.approx([20.0])
+    assert robot.command(ForceCommand(stamp + 4), 0.02, stopped=True) == pytest.approx([20.0])
 
 
 def test_friction_change_applies_at_once() -> None:
@@ -254,7 +258,7 @@ def test_friction_change_applies_at_once() -> None:
         for n in range(50):
             stamp = SECOND + (50 * k + n) * 1_000_000
             robot.measurement(state(['insertion'], [0.02], [0.0], stamp=stamp))
-            ways.append((robot.command(push(stamp, 3.0)) or [])[0])
+            ways.append((robot.command(push(stamp, 3.0), 0.02) or [])[0])
     assert ways[99] - ways[98] == pytest.approx(3.0 / phantom.viscous_friction * 1e-3, rel=1e-6)
     assert ways[149] - ways[148] == pytest.approx(0.5 * (ways[99] - ways[98]), rel=1e-6)
 
@@ -263,7 +267,7 @@ def test_known_load_does_not_move_the_virtual_base() -> None:
     """The law adds the load to its force; the virtual base excludes it."""
     robot = moves()
     robot.measurement(state(['insertion'], [0.02], [0.0]))
-    assert robot.command(push(SECOND, 5.0), 5.0) == [0.02]
+    assert robot.command(push(SECOND, 5.0), 0.02, 5.0) == [0.02]
 
 
 @pytest.mark.parametrize(

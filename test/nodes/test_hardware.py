@@ -496,6 +496,79 @@ def test_duplicate_source_or_commander_gives_zero_force(
     bench.until(lambda: bench.robot.mass.velocity < -1e-3, 'motion again')
 
 
+@pytest.mark.requirement('S-325')
+@pytest.mark.parametrize('stopped', [True, False])
+def test_position_robot_that_was_moved_is_not_moved_back(
+    ros_graph: RosGraph, *, stopped: bool
+) -> None:
+    """Moved by hand without drive, in a stop or at the target: nothing moves with the drive."""
+    bench = Bench(ros_graph, 'position')
+    bench.aim(0.04)
+    bench.arrive(0.04)
+    bench.goal = None
+    if stopped:
+        stop = bench.user.create_client(Trigger, 'controller/stop')
+        bench.until(stop.service_is_ready, 'the service')
+        stop.call_async(Trigger.Request())
+        bench.until(lambda: bench.stop, 'the stop')
+    robot = bench.robot
+    (listens,) = (one for one in robot.subscriptions if one.topic_name.endswith('trajectory'))
+    drive, listens.callback = listens.callback, lambda _message: None
+    robot.position = robot.goal = 130.0
+    bench.until(lambda: bench.stop, 'the stop')
+    count = len(bench.commands)
+    bench.until(lambda: len(bench.commands) > count + 50, 'commands after it')
+    listens.callback = drive
+    count = len(bench.commands)
+    bench.until(lambda: len(bench.commands) > count + 50, 'commands with drive')
+    # A tenth of the lead of 2 mm.
+    assert max(bench.values()[count:]) < 130.2
+    assert robot.position < 130.2
+
+
+@pytest.mark.requirement('S-326')
+def test_restarted_position_robot_gets_no_old_position(ros_graph: RosGraph) -> None:
+    """While two nodes publish joint states, and after: it rests where it has started."""
+    bench = Bench(ros_graph, 'position')
+    bench.aim(0.15)
+    bench.until(lambda: bench.depth > 0.03, 'motion')
+    bench.goal = None
+    first = bench.robot
+    for timer in list(first.timers):
+        first.destroy_timer(timer)
+    bench.until(lambda: 'joint_states is stale' in bench.status.fault, 'the watchdog')
+    count = len(bench.commands)
+    second = ros_graph.add(DRIVERS['PositionRobot'])
+    second.position = second.goal = 110.0
+    bench.until(lambda: bench.said == '2 nodes publish joint_states', 'two publishers')
+    bench.until(lambda: sum(bench.input('joint_states').rejected.values()) > 50, 'measurements')
+    first.destroy_publisher(first.states)
+    bench.until(lambda: bench.said != '2 nodes publish joint_states', 'one publisher')
+    count = len(bench.commands)
+    bench.until(lambda: len(bench.commands) > count + 20, 'commands')
+    assert max(bench.values()[count:]) < 110.2
+    assert second.position < 110.2
+
+
+@pytest.mark.requirement('S-314')
+def test_position_robot_short_of_its_target_stops_the_system(ros_graph: RosGraph) -> None:
+    """By less than the lead of 2 mm."""
+    bench = Bench(ros_graph, 'position')
+    robot, drive = bench.robot, bench.robot.on_command
+    (listens,) = (one for one in robot.subscriptions if one.topic_name.endswith('trajectory'))
+
+    def limited(message: JointTrajectory) -> None:
+        drive(message)
+        robot.goal = min(robot.goal, 139.0)
+
+    listens.callback = limited
+    bench.aim(0.04)
+    bench.goal = None
+    bench.until(lambda: bench.stop, 'the stop')
+    assert str(bench.stop).startswith('the robot does not follow its position command: 0')
+    bench.until(lambda: bench.values()[-1] < 139.2, 'a command at the robot')
+
+
 @pytest.mark.requirement('S-103')
 def test_zero_command_is_repeated_after_loss_of_measurements(ros_graph: RosGraph) -> None:
     """A driver without a timeout would keep the last effort if one message is lost."""
