@@ -2,6 +2,7 @@
 """Read the newest measurements of a running graph on demand."""
 
 from dataclasses import replace
+from math import inf
 from time import time_ns
 from typing import Final
 
@@ -97,6 +98,11 @@ class Readings:
             return False
         depth, velocity = reference
         return abs(depth - target) < _SAME and abs(velocity) < _SAME
+
+    def distance(self, target: float) -> float:
+        """Return the distance of the measured depth from a target [m]; inf if unknown."""
+        insertion = self.insertion()
+        return inf if insertion is None else abs(insertion[0] - target)
 
     def line(self) -> str:
         words = []

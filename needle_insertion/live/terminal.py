@@ -34,7 +34,10 @@ from needle_ros.status import (
 from rclpy.task import Future
 
 _ANSWER: Final = 30.0  #: Timeout of the first status and the first measurements of a node [s].
-_SETTLING: Final = 1.0  #: Settling time of the needle after the end of the reference [s].
+#: Settling time of the needle after the end of the reference, and the longest one [s].
+_SETTLING: Final = 1.0
+_LATEST: Final = 5.0
+_NEAR: Final = 5e-4  #: Largest distance of a needle at its target [m].
 
 #: Timeout of a stop [s], and velocity below which the needle rests [m/s].
 _BRAKING: Final = 2.0
@@ -257,9 +260,10 @@ class Terminal(Cmd):
             raise _unfit('wait', words)
         # Time of the robot: simulated time may be slower than the time of this machine.
         begin, arrived = self._readings.time, inf
+        last, since = begin, monotonic()
 
         def done() -> bool:
-            nonlocal arrived
+            nonlocal arrived, last, since
             now = self._readings.time
             self._screen.show(self._readings.line())
             state = self._state(STEERING if self._steers else CONTROLLER)
@@ -272,9 +276,20 @@ class Terminal(Cmd):
                 return isinstance(status, SteeringStatus) and status.phase in _AT_REST
             if not isinstance(status, ControllerStatus) or status.target is None:
                 raise JobError('there is no target to wait for')
+            if now != last:
+                last, since = now, monotonic()
+            # Time may be halted by a user, without a fault.
+            if status.fault and monotonic() - since > _SILENT:
+                raise JobError(f'no measurement for {_SILENT:g} s: {status.fault}')
             rests = self._readings.reference_rests_at(status.target)
             arrived = min(arrived, now) if rests else inf
-            return now > arrived + _SETTLING
+            away = self._readings.distance(status.target)
+            if now > arrived + _LATEST:
+                raise JobError(
+                    f'the needle rests {1e3 * away:.2f} mm from its target: '
+                    f'{self._readings.line()}'
+                )
+            return now > arrived + _SETTLING and away <= _NEAR
 
         # The timeout is above, with the position of the needle in its error.
         self._await(done, 'the needle', brief=False)

@@ -25,9 +25,11 @@ from needle_insertion.live.readings import Readings
 from needle_insertion.live.screen import Screen
 from needle_insertion.live.terminal import Terminal, Warnings
 from needle_insertion.replay.rerun import verify
+from needle_ros.base_node import SENSOR
 import pytest
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from support.installed import ROOT
 from support.plans import bowed_plan
@@ -254,6 +256,26 @@ def test_robot_with_own_topic_and_joint(ros_graph: RosGraph, tmp_path: Path) -> 
     assert float(after) == pytest.approx(stage.position - 100.0, abs=0.1)
     assert float(after) == pytest.approx(22.0, abs=0.1)
     assert 'no measurements' not in said
+
+
+def test_wait_ends_when_the_robot_is_silent(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Its clock, which the time of `wait` counts, stands still."""
+    plant = ros_graph.add(PlantNode, parameters={'rate': 200.0, 'depth': 0.02})
+    node = ros_graph.node('watcher')
+    states = ros_graph.listen(node, JointState, 'joint_states', SENSOR)
+
+    def die() -> None:
+        if states and states[-1].position[0] > 0.021 and plant.is_active:
+            plant.trigger_deactivate()
+
+    node.create_timer(0.02, die)
+    status, said, complained = told(
+        ros_graph, tmp_path / 'run', ['target 60mm', 'wait 300'], '--hardware'
+    )
+    assert status == 1
+    assert re.search('error: line 2: no measurement for 5 s: joint_states is stale', complained), (
+        said + complained
+    )
 
 
 def test_wrong_topic_of_a_robot_is_reported_during_the_start(
