@@ -144,7 +144,7 @@ def _add_common(
         name = f'--{item.name.replace("_", "-")}'
         if item.metadata.get('type') is bool:
             common.add_flag(fitting, name, item.metadata['description'])
-        elif 'unit' in item.metadata:
+        elif 'unit' in item.metadata and not isinstance(item.default, tuple):
             unit = item.metadata['unit']
             default = f'{item.default:g} {unit}'.removesuffix(' 1')
             meaning = f'{item.metadata["description"]} (default {default})'
