@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from math import ceil, expm1, inf
 from typing import Any, Final
@@ -20,6 +20,7 @@ from needle_ros.settings import (
     constant,
     flag,
     from_values,
+    number_fields,
     positive,
 )
 import numpy as np
@@ -164,10 +165,9 @@ class NeedleParameters:
 
     def __post_init__(self) -> None:
         check_constants(self)
-        for item in fields(self):
-            if 'unit' in item.metadata and not isinstance(item.default, tuple):
-                # An integer would cause compiled functions to be compiled for another type.
-                object.__setattr__(self, item.name, float(getattr(self, item.name)))
+        for name in number_fields(self):
+            # An integer would cause compiled functions to be compiled for another type.
+            object.__setattr__(self, name, float(getattr(self, name)))
         if self.minimum_depth >= self.length:
             raise ParameterError(
                 f'minimum_depth must be < length = {self.length:g} m, got {self.minimum_depth!r}'

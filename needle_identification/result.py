@@ -3,7 +3,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import fields
 from math import atan2, hypot, isfinite, log, sqrt
 from pathlib import Path
 from typing import Final
@@ -22,6 +21,7 @@ from needle_identification.steering.estimate import SteeringEstimate
 from needle_identification.stiffness.identify import StiffnessSummary
 from needle_ros.files import write_whole
 from needle_ros.quantities import AXES
+from needle_ros.settings import number_fields
 import yaml
 
 NODES: Final = ('plant', 'controller')  #: nodes that use the result
@@ -41,7 +41,7 @@ def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
     # Imported here: the import of the model takes longer than all other imports together.
     from needle_dynamics import NeedleParameters
 
-    constants = {item.name: item for item in fields(NeedleParameters) if 'unit' in item.metadata}
+    constants = number_fields(NeedleParameters)
     values: dict[str, float | str] = {}
     for statistic in statistics:
         item = constants.get(statistic.name)

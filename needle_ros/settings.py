@@ -97,6 +97,15 @@ def check_constants(values: object) -> None:
             raise ParameterError(f'{item.name} must be {_NAMES[meta["type"]]}, got {value!r}')
 
 
+def number_fields(settings: Any) -> dict[str, Field[Any]]:
+    """Return the fields of a dataclass that are one number, by name."""
+    return {
+        item.name: item
+        for item in fields(settings)
+        if 'unit' in item.metadata and not isinstance(item.default, tuple)
+    }
+
+
 def _may_be_single(item: Field[Any]) -> bool:
     return 'float |' in str(item.type)
 

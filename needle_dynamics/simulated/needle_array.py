@@ -10,16 +10,14 @@ from typing import Any, Final, overload
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_dynamics.parameters import LEAST_RATIOS, NeedleParameters
 from needle_ros.errors import ParameterError, ShapeError
-from needle_ros.settings import unknown_name
+from needle_ros.settings import number_fields, unknown_name
 import numpy as np
 from numpy.typing import ArrayLike
 
 #: Fields with a number for each layer.
 _LAYERS: Final = ('layer_depths', 'layer_stiffnesses')
 #: Fields with one number, and their metadata.
-_NUMBERS: Final = {
-    item.name: item.metadata for item in fields(NeedleParameters) if 'unit' in item.metadata
-}
+_NUMBERS: Final = {name: item.metadata for name, item in number_fields(NeedleParameters).items()}
 
 
 class NeedleArray(Sequence[NeedleParameters]):

@@ -142,7 +142,7 @@ def test_unreachable_targets_are_rejected_or_warned_of(
         (['--turns', '-1'], 'turns must be finite, >= 0, got -1'),
         (['--limit', '0'], 'guide_limit and turns cannot both be 0: nothing would move'),
         (['--load-limit', '0'], 'load_limit must be > 0 N, got 0.0'),
-        (['--seed', '-1'], '--seed must be >= 0, got -1'),
+        (['--seed', '-1'], '--seed must be an integer from 0 to 4611686018427387904, got -1'),
         (['--target=0,-0.1,0'], 'the depth must be in (0, 160] mm'),
         (['-o', 'needle.csv'], 'the picture must be .png'),
         (['-o', '/no/such/folder/x.png'], 'its folder does not exist'),

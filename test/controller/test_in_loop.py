@@ -333,7 +333,7 @@ def test_batch_noise_is_encoder_noise() -> None:
     with pytest.raises(ParameterError, match='delay and late >= 0'):
         run_batch(law, NOMINAL, START, REFERENCE, late=-1, **options)
     for wrong in (noise[1:], noise.T, noise.ravel(), np.nan * noise, ['a']):
-        with pytest.raises(ShapeError, match='noise must be'):
+        with pytest.raises(NeedleError, match='noise must'):
             run_batch(law, NOMINAL, START, REFERENCE, noise=wrong, **options)
     for added in ([[0.01, -1.0, 0.0]], [[0.02, 1.0, 0.0], [0.01, 1.0, 0.0]]):
         with pytest.raises(ParameterError, match='added must have increasing depths'):

@@ -522,7 +522,7 @@ def test_distance_grows_with_the_deflection() -> None:
         ({'time': np.nan}, ParameterError, 'time must be finite'),
         ({'sliding': 'up'}, ParameterError, 'one of insertion, withdrawal'),
         ({'state': np.zeros(6)}, ShapeError, r'shape \(8,\), got \(6,\)'),
-        ({'state': np.full(8, np.nan)}, ShapeError, 'must be finite'),
+        ({'state': np.full(8, np.nan)}, ParameterError, 'must be finite'),
         ({'state': np.array([0.2, *np.zeros(7)])}, InsertionDepthError, 'insertion depth 0 m'),
     ],
 )

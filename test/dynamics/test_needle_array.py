@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from hypothesis import given, settings
@@ -21,6 +21,7 @@ from needle_dynamics import (
 from needle_dynamics.parameters import LEAST_RATIOS
 from needle_dynamics.simulated.batch import _check, lane_constants, lane_layers
 from needle_dynamics.simulated.needle_array import columns_of
+from needle_ros.settings import number_fields
 import numpy as np
 import pytest
 
@@ -37,14 +38,13 @@ BASES = (
 )
 #: Range of each field for valid needles that contain the start.
 RANGES: dict[str, tuple[float, float]] = {
-    item.name: (
-        (0.1, 0.25) if item.name == 'length'
-        else (1e-3, 1e-2) if item.name == 'minimum_depth'
-        else (1.0, 2.0) if item.name == 'breakaway_friction'
-        else (0.5 * getattr(BASE, item.name), 2.0 * getattr(BASE, item.name) + 0.1)
+    name: (
+        (0.1, 0.25) if name == 'length'
+        else (1e-3, 1e-2) if name == 'minimum_depth'
+        else (1.0, 2.0) if name == 'breakaway_friction'
+        else (0.5 * getattr(BASE, name), 2.0 * getattr(BASE, name) + 0.1)
     )
-    for item in fields(BASE)
-    if 'unit' in item.metadata
+    for name in number_fields(BASE)
 }  # fmt: skip
 
 

@@ -10,16 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from needle_dynamics import NeedleError, NeedleParameters, ParameterError
 from needle_dynamics.parameters import PRESETS
-from needle_ros.settings import from_values
+from needle_ros.settings import from_values, number_fields
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 
-NUMBERS = [item.name for item in fields(NeedleParameters) if 'unit' in item.metadata]
+NUMBERS = [*number_fields(NeedleParameters)]
 MAY_BE_ZERO = [
-    item.name
-    for item in fields(NeedleParameters)
-    if 'unit' in item.metadata and item.metadata['low'] == 0.0 and not item.metadata['open_low']
+    name
+    for name, item in number_fields(NeedleParameters).items()
+    if item.metadata['low'] == 0.0 and not item.metadata['open_low']
 ]
 #: Lower bounds of the ranges.
 LOWEST = {name: NeedleParameters.__dataclass_fields__[name].metadata['low'] for name in NUMBERS}

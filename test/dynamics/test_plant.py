@@ -396,5 +396,5 @@ def test_plant_can_start_from_modal_coordinates() -> None:
     assert plant.integrator.state[2:4].tolist() == [1e-5, 2e-6]
     with pytest.raises(ParameterError, match='modal and tip_deflection both define'):
         PlantConstants.of({'modal': [1e-5, 2e-6], 'tip_deflection': 1e-3}).make()
-    with pytest.raises(ParameterError, match='modal must be numbers'):
+    with pytest.raises(ParameterError, match='modal must be a number'):
         PlantConstants.of({'modal': ['one', 'two']})

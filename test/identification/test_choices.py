@@ -145,7 +145,7 @@ def test_friction_along_the_needle_is_identified(
     [
         ({'terms': ('coulomb', 'layers')}, 'need each other'),
         ({'layers': (0.01,)}, 'need each other'),
-        ({'terms': ('layers',), 'layers': (0.02, 0.01)}, 'finite and increase'),
+        ({'terms': ('layers',), 'layers': (0.02, 0.01)}, 'layers must increase'),
         ({'terms': ('layers', 'length'), 'layers': (0.0,)}, 'takes the place'),
     ],
 )

@@ -85,7 +85,7 @@ def test_command_keeps_the_results_of_a_plan(
         ({'folder': '.'}, 'settings must have the files plan, segmentation, labels'),
         ({'segmentation': 3}, 'must be names of files'),
         ({'plan': 'none.yaml'}, 'none.yaml'),
-        ({'labels': 'none.yaml'}, 'none.yaml: No such file'),
+        ({'labels': 'none.yaml'}, 'none.yaml cannot be read'),
         ({'segmentation': 'none.nrrd'}, 'none.nrrd: No such file'),
         ({'radius': 0.0}, 'radius'),
         ({'turns': 1}, 'settings.turns must be 0'),

@@ -430,7 +430,7 @@ def test_invalid_input_is_rejected() -> None:
             SteeringModel(NEEDLE, STEERING, depths)
     with pytest.raises(ParameterError, match=r'depths must be in \[0, 0\.16\] m'):
         SteeringModel(NEEDLE, STEERING, [0.0, 0.17])
-    with pytest.raises(ShapeError, match=r'target must be x and z, got shape \(3,\)'):
+    with pytest.raises(ShapeError, match=r'target must have shape \(2,\), got \(3,\)'):
         MultiHypothesisLaw(MODEL, (0.0, 0.1, 0.0), LIMITS)
     with pytest.raises(ParameterError, match='target must be finite'):
         MultiHypothesisLaw(MODEL, (0.0, np.inf), LIMITS)
