@@ -10,3 +10,7 @@ class RecordingError(NeedleError):
 
 class IdentificationError(NeedleError):
     """The recordings do not determine the parameters."""
+
+
+class WrongSignError(IdentificationError):
+    """A constant that cannot be negative is clearly negative."""

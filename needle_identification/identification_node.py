@@ -21,7 +21,7 @@ from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
 )
-from needle_identification.result import model_parameters, NODES, write_result
+from needle_identification.result import limited, model_parameters, NODES, write_result
 from needle_identification.stiffness.identify import (
     identify_stiffness,
     StiffnessEstimate,
@@ -322,7 +322,7 @@ class IdentificationNode(BaseNode):
         self, _request: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response | Future:
         """Set the last result in other nodes; respond after all of them have responded."""
-        values = model_parameters(self._found)
+        values, beyond = model_parameters(self._found), limited(self._found)
         if not values:
             response.message = 'nothing identified yet that plant and controller can use'
             return response
@@ -341,7 +341,7 @@ class IdentificationNode(BaseNode):
             outcomes = [_outcome(name, values, answer) for name, answer in answers.items()]
             verdicts = [verdict for verdict, _ in outcomes if verdict is not None]
             response.success = bool(verdicts) and all(verdicts)
-            response.message = '; '.join(words for _, words in outcomes)
+            response.message = '; '.join([*(words for _, words in outcomes), *beyond])
             later.set_result(response)
             # Two statements: rclpy rejects a second severity from the same source line.
             if response.success:

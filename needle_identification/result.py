@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write identified parameters to a ROS parameter file for plant, controller and steering."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from math import atan2, hypot, isfinite, log, sqrt
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Final
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import (
     between,
+    measured,
     ParameterEstimate,
     Statistic,
     suffix,
@@ -38,34 +39,54 @@ _WIDTH: Final = 3.92  # width of a 95 % interval over the standard deviation
 
 def model_parameters(statistics: Iterable[Statistic]) -> dict[str, float | str]:
     """Return identified constants of the model, within their ranges, as parameters of nodes."""
+    found = list(_within_ranges(statistics))
+    values: dict[str, float | str] = {f'model.{one.name}': _short(value) for one, value in found}
+    if 'model.breakaway_friction' in values:
+        values['model.friction_law'] = 'stribeck'
+    return values
+
+
+def constants_of(summary: FrictionSummary | StiffnessSummary) -> Sequence[Statistic]:
+    """Return the statistics that a parameter file describes."""
+    if isinstance(summary, FrictionSummary):
+        return summary.statistics
+    return (summary.tissue_stiffness,)
+
+
+def limited(statistics: Iterable[Statistic]) -> list[str]:
+    """Return a sentence for each constant that is outside its range and set to the limit."""
+    return [
+        f'{one.symbol} = {measured(one.mean, one.error, one.unit)} is outside the range of the '
+        f'model: model.{one.name} is {value:g}'
+        for one, value in _within_ranges(statistics)
+        if value != one.mean
+    ]
+
+
+def _within_ranges(statistics: Iterable[Statistic]) -> Iterator[tuple[Statistic, float]]:
+    """Yield the constants of the model with their values within their ranges."""
     # Imported here: the import of the model takes longer than all other imports together.
     from needle_dynamics import NeedleParameters
 
     constants = number_fields(NeedleParameters)
-    values: dict[str, float | str] = {}
-    for statistic in statistics:
-        item = constants.get(statistic.name)
-        if item is not None and isfinite(statistic.mean):
-            low, high = item.metadata['low'], item.metadata['high']
-            values[f'model.{item.name}'] = _short(min(max(statistic.mean, low), high))
-    if 'model.breakaway_friction' in values:
-        values['model.friction_law'] = 'stribeck'
-    return values
+    for one in statistics:
+        item = constants.get(one.name)
+        if item is not None and isfinite(one.mean):
+            yield one, min(max(one.mean, item.metadata['low']), item.metadata['high'])
 
 
 def result_yaml(
     friction: FrictionSummary | None, stiffness: StiffnessSummary | None = None
 ) -> str:
     """Return the text of a ROS parameter file with the identified parameters."""
-    found = [
-        *(friction.statistics if friction else ()),
-        *([stiffness.tissue_stiffness] if stiffness else ()),
-    ]
-    names = [e.name for summary in (friction, stiffness) if summary for e in summary.estimates]
+    summaries = [summary for summary in (friction, stiffness) if summary]
+    found = [one for summary in summaries for one in constants_of(summary)]
+    names = [e.name for summary in summaries for e in summary.estimates]
     values = model_parameters(found)
     if not values:
         raise IdentificationError('the data determine no parameter of the model')
-    lines = [*map(_described, found), *(f'from {" ".join(name.split())}' for name in names)]
+    sources = [f'from {" ".join(name.split())}' for name in names]
+    lines = [*map(_described, found), *limited(found), *sources]
     return _file('Needle and tissue', lines, dict.fromkeys(NODES, values))
 
 

@@ -10,7 +10,7 @@ from math import floor, inf, isfinite, log10, nan, sqrt
 from typing import Any, Final, TYPE_CHECKING, TypeAlias, TypeVar
 
 from needle_dynamics.display import Displayed, new_figure
-from needle_identification.errors import IdentificationError
+from needle_identification.errors import IdentificationError, WrongSignError
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
@@ -115,6 +115,15 @@ def with_half_width(
     """Return a determined copy, with an interval symmetric about the value."""
     interval = (value - half_width, value + half_width)
     return replace(unknown, value=value, error=error, interval=interval, determined=True)
+
+
+def check_sign(what: str, parameter: ParameterEstimate) -> None:
+    """Raise `WrongSignError` if a parameter is clearly negative."""
+    if parameter.determined and parameter.value + 2.0 * parameter.error < 0.0:
+        raise WrongSignError(
+            f'{what} must not be negative, got {parameter.symbol} = {parameter.value:.3g} '
+            f'{parameter.unit}; the force or the motion may have the wrong sign'
+        )
 
 
 _Named = TypeVar('_Named', ParameterEstimate, Statistic)

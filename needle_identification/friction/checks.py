@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.estimate import ParameterEstimate
+from needle_identification.estimation.estimate import check_sign, ParameterEstimate
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.comparison import CandidateFit
 from needle_identification.friction.design import Design
@@ -27,11 +27,7 @@ def check_friction(parameters: Sequence[ParameterEstimate]) -> None:
     for parameter in friction:
         if by_depth and parameter.name == 'coulomb_friction':
             continue
-        if parameter.determined and parameter.value + 2.0 * parameter.error < 0.0:
-            raise IdentificationError(
-                f'friction must not be negative, got {parameter.symbol} = {parameter.value:.3g} '
-                f'{parameter.unit}; the force or the motion may have the wrong sign'
-            )
+        check_sign('friction', parameter)
     if friction and all(p.determined and abs(p.value) < 2.0 * p.error for p in friction):
         sizes = ', '.join(f'{p.symbol} = {p.value:.2g} ± {p.error:.2g} {p.unit}' for p in friction)
         raise IdentificationError(

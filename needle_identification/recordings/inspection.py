@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
-from needle_identification.errors import RecordingError
+from needle_identification.errors import RecordingError, WrongSignError
 from needle_identification.recordings import reading, tables
 from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
 from needle_identification.steering.reading import (
@@ -233,9 +233,7 @@ def _bag(path: Path) -> Inspection:
         words, command = _suggestion(path, signals)
     if not command:
         with suppress(NeedleError):
-            identify_stiffness(reading.read_indentation_recording(path))
-            words = ['presses at several places and forces: stiffness can be identified']
-            command = shlex.join(['needle', 'identify', 'stiffness', str(path)])
+            words, command = _pressed(path)
     return Inspection(
         path=str(path), contents=tuple(contents), losses=tuple(losses), words=tuple(words),
         command=command,
@@ -266,6 +264,17 @@ def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
     )
     named = ['--columns', ','.join(f'{r}={n}' for r, n in columns.items())] if columns else []
     return [what], shlex.join(['needle', 'identify', 'steering', str(path), *named])
+
+
+def _pressed(path: Path) -> tuple[list[str], str]:
+    """Return words and command for presses; raise `NeedleError` if there are none."""
+    recording = reading.read_indentation_recording(path)
+    try:
+        identify_stiffness(recording)
+    except WrongSignError as error:
+        return [str(error).removeprefix(f'{recording.name}: ')], ''
+    what = 'presses at several places and forces: stiffness can be identified'
+    return [what], shlex.join(['needle', 'identify', 'stiffness', str(path)])
 
 
 def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:

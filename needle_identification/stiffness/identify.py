@@ -10,13 +10,14 @@ places is as in Table 2.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, pairwise
+from itertools import chain, pairwise, product
 from math import hypot, nan, sqrt
 from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import (
+    check_sign,
     DisplayedEstimate,
     EstimateRows,
     measured,
@@ -228,7 +229,7 @@ def identify_stiffness(
     Raises
     ------
     IdentificationError
-        If there is no press.
+        If there is no press, or if the stiffness is negative.
 
     Examples
     --------
@@ -252,14 +253,14 @@ def identify_stiffness(
         members = [presses.level == index for index in range(int(presses.level.max()) + 1)]
         fit = partial(matrix.fit_matrix, presses, noise, estimator=settings.estimator)
         fits = [fit(np.flatnonzero(chosen)) for chosen in members]
+        levels = [_level(presses, *pair, settings) for pair in zip(members, fits, strict=True)]
+        for level, name in product(levels, ('k_xx', 'k_zz')):
+            check_sign('stiffness', level[name])
     except IdentificationError as error:
-        raise IdentificationError(f'{recording.name}: {error}') from None
-    levels = []
+        raise type(error)(f'{recording.name}: {error}') from None
     by_doubt: dict[str, list[str]] = {}
-    for chosen, found in zip(members, fits, strict=True):
-        level = _level(presses, chosen, found, settings)
-        levels.append(level)
-        for doubt, detail in _doubts(level, found):
+    for level, one in zip(levels, fits, strict=True):
+        for doubt, detail in _doubts(level, one):
             by_doubt.setdefault(doubt, []).append(f'{detail} at {level.force:.3g} N')
     warnings += [f'{doubt} ({"; ".join(details)})' for doubt, details in by_doubt.items()]
     size = np.maximum(np.hypot(*presses.displacement.T), 1e-15)

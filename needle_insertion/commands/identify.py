@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import needle_identification as identification
 from needle_identification.recordings.tables import column_roles, recordings_in, ROLES
+from needle_identification.result import constants_of, limited
 from needle_identification.steering.reading import STEERING_ROLES
 from needle_insertion.commands import common
 from needle_insertion.commands.identify_sensor import add_sensor
@@ -222,6 +223,8 @@ def _identify(
     written, errors = common.try_write(
         options.output, lambda path: identification.write_result(path, **result)
     )
+    if written:
+        common.print_each('warning', limited(constants_of(summary)))
     if options.report is not None:
         # Imports plotting: not needed for tables.
         from needle_insertion.report.identify_page import write_identified_page

@@ -318,6 +318,18 @@ def test_plane_of_the_presses_can_be_selected(
     assert '--axes must name two axes' in err
 
 
+def test_presses_with_a_reversed_force_are_rejected(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """The sign is named, also if the kind is not given."""
+    path, file = str(tmp_path / 'place'), tmp_path / 'result.yaml'
+    write_presses(Path(path), turn_force=((-1, 0), (0, -1)))
+    for words in (['stiffness', path, '-o', str(file)], [path]):
+        _, err = identify(capsys, *words, status=2)
+        assert 'stiffness must not be negative, got k_xx = -' in err
+    assert not file.exists()
+
+
 def test_friction_figures_draw_excluded_samples() -> None:
     """Each sample is drawn against velocity, those without a part in the fit by their name."""
     estimate = identify_friction(simulated())

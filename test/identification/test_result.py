@@ -15,7 +15,7 @@ from needle_identification import (
     write_result,
 )
 from needle_identification.estimation.estimate import between, measured, rounded, UNKNOWN
-from needle_identification.result import model_parameters, result_yaml
+from needle_identification.result import limited, model_parameters, result_yaml
 from needle_ros.settings import from_values
 import pytest
 import yaml
@@ -81,13 +81,13 @@ def test_undetermined_parameters_are_not_set() -> None:
 
 def test_a_mean_outside_the_range_is_set_to_the_limit() -> None:
     """The model rejects negative friction, and breakaway friction below Coulomb friction."""
-    values = model_parameters(
-        [
-            found('coulomb_friction', -0.001),
-            found('breakaway_friction', 0.99, unit='1'),
-            found('offset', 0.1),
-        ]
-    )
+    outside = found('coulomb_friction', -0.001), found('breakaway_friction', 0.99, unit='1')
+    values = model_parameters([*outside, found('offset', 0.1)])
+    sentences = limited([*outside, found('offset', 0.1), found('viscous_friction', 0.3)])
+    assert len(sentences) == len(outside)
+    assert 'coulomb_friction = -0.001 ± 0.010 N is outside the range' in sentences[0]
+    assert sentences[1].endswith('model.breakaway_friction is 1')
+    assert all(f'# {words}\n' in result_yaml(friction(*outside)) for words in sentences)
     assert values == {
         'model.coulomb_friction': 0.0,
         'model.breakaway_friction': 1.0,

@@ -549,6 +549,17 @@ def test_recordings_without_presses_are_rejected() -> None:
         StiffnessSettings(estimator='best')
 
 
+@pytest.mark.parametrize('signs', [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0)])
+def test_a_reversed_force_is_rejected(signs: tuple[float, float]) -> None:
+    """On either axis, with the value and a reason, and the recording is not proposed."""
+    recording = pressed(TABLE[1.3], grid((1.3,)), noise=1.0)
+    entry = 'k_xx = -1.1e.03' if signs[0] < 0.0 else 'k_zz = -690'
+    with pytest.raises(
+        IdentificationError, match=f'^place: stiffness must not be negative, got {entry}.*sign'
+    ):
+        identify_stiffness(replace(recording, force=recording.force * signs))
+
+
 def test_summary_is_a_column_of_table_2_per_level() -> None:
     rng = np.random.default_rng(8)
     places = [

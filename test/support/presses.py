@@ -8,6 +8,7 @@ from typing import Any
 
 from needle_identification import BagWriter
 import numpy as np
+from numpy.typing import ArrayLike
 from support.samples import EPOCH, header, STORE, WRENCH
 
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -37,15 +38,16 @@ def presses(seed: int) -> tuple[Any, Any, Any]:
     return time, np.concatenate(position), np.concatenate(force)
 
 
-def write_presses(path: Path, seed: int = 0) -> None:
-    """Write a recording of presses with the topics of the indenter."""
+def write_presses(path: Path, seed: int = 0, turn_force: ArrayLike = ((1, 0), (0, 1))) -> None:
+    """Write a recording of presses, by the topics of the indenter; the force may be turned."""
     kinds = STORE.types
     point, turn = kinds['geometry_msgs/msg/Point'], kinds['geometry_msgs/msg/Quaternion']
     vector, pair = kinds['geometry_msgs/msg/Vector3'], kinds['geometry_msgs/msg/Wrench']
     with BagWriter(path) as bag:
         bag.add_topic('/base_wrench', WRENCH)
         bag.add_topic('/end_effector_pose', POSE)
-        for time, (x, z), (f_x, f_z) in zip(*presses(seed), strict=True):
+        for time, (x, z), force_now in zip(*presses(seed), strict=True):
+            f_x, f_z = (np.asarray(turn_force) @ force_now).tolist()
             stamp = EPOCH + round(time * 1e9)
             pose = kinds['geometry_msgs/msg/Pose'](point(x, 0.0, z), turn(0.0, 0.0, 0.0, 1.0))
             force = pair(vector(f_x, 0.0, f_z), vector(0.0, 0.0, 0.0))
