@@ -54,6 +54,7 @@ class MatrixFit(NamedTuple):
     scatter: float = 0.0  # of the presses about the matrix over their noise [1]
     condition: float = inf  # of the displacements
     systematic: float = 0.0  # relative error of the whole matrix by creep and hysteresis
+    carried: FloatArray = np.zeros((2, 2))  # error of K by what remains of the press before
 
     def derived(
         self, name: str, symbol: str, unit: str, value: float, gradient: FloatArray
@@ -66,7 +67,8 @@ class MatrixFit(NamedTuple):
         error = sqrt(variance)
         half_width = error * float(stdtrit(freedom, 0.975))
         if self.systematic:
-            slack = self.systematic * abs(float(np.nansum(gradient * self.matrix)))
+            scale = self.systematic * float(np.nansum(gradient * self.matrix))
+            slack = hypot(scale, float(np.sum(gradient * self.carried)))
             error, half_width = hypot(error, slack), hypot(half_width, 2.0 * slack)
         return with_half_width(parameter, value, error, half_width)
 
@@ -129,7 +131,21 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
         scatter=sqrt(float(scaled_x @ scaled_x + scaled_z @ scaled_z) / (2.0 * freedom)),
         condition=fit.condition,
         systematic=noise.systematic,
+        carried=noise.set * _carried(matrix, presses.displacement, chosen, columns),
     )
+
+
+def _carried(
+    matrix: FloatArray, displacement: FloatArray, chosen: IntArray, columns: IntArray
+) -> FloatArray:
+    """Return the change of K if all of the press before remained at the rest after it."""
+    # The zero between two rests has half of it, and the press itself from none to all: the
+    # difference is at most half. In turn around the place, this rotates the displacements.
+    before = np.vstack([np.zeros(2), displacement[:-1]])[chosen][:, columns]
+    share = np.linalg.lstsq(displacement[chosen][:, columns], before, rcond=None)[0].T
+    change = np.zeros((2, 2))
+    change[:, columns] = 0.5 * matrix[:, columns] @ share
+    return change
 
 
 def _deviation(

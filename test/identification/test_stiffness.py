@@ -520,6 +520,35 @@ def test_doubtful_results_have_warnings() -> None:
     assert identify_stiffness(pressed(ROUND[1.1], grid((1.1,)), noise=1.0)).warnings == ()
 
 
+def creeping(forces: FloatArray, fraction: float, time: float, seed: int) -> IndentationRecording:
+    """Press a symmetric tissue that yields by a further fraction, with a time constant."""
+    matrix = np.array([[900.0, 60.0], [60.0, 700.0]])
+    exact = pressed(matrix, forces, hold=1.0, rest=1.0, noise=1.0, seed=seed)
+    keep = np.exp(-1.0 / RATE / time)
+    later = lfilter([1.0 - keep], [1.0, -keep], exact.position - exact.position[0], axis=0)
+    return replace(exact, position=exact.position + fraction * later)
+
+
+@pytest.mark.parametrize(('fraction', 'time'), [(0.02, 1.0), (0.05, 1.0), (0.1, 0.5)])
+def test_the_curl_has_the_error_of_creep(fraction: float, time: float) -> None:
+    """What remains of the press before turns the displacements, by the order of the presses."""
+    around = grid((1.0, 2.0))
+    to_and_fro = around.reshape(2, 2, 4, 2).swapaxes(1, 2).reshape(-1, 2)
+    for seed in range(4):
+        errors = []
+        for order, sign in ((around, -1.0), (around[::-1], 1.0), (to_and_fro, 0.0)):
+            estimate = identify_stiffness(creeping(order, fraction, time, seed))
+            assert any('the errors include it' in words for words in estimate.warnings)
+            for level in estimate.levels:
+                # The scatter alone has a tenth of this error: 0 was outside in every recording.
+                assert level.curl.interval[0] <= 0.0 <= level.curl.interval[1]
+                assert level.curl.value * sign >= 0.0
+                assert level.is_spring
+            errors.append(estimate.levels[-1].curl.error)
+        # Every second press is opposite to the one before, which turns nothing.
+        assert errors[2] < errors[0]
+
+
 def test_presses_inconsistent_with_a_matrix_are_reported() -> None:
     forces = grid((1.1,))
     stiffer = {1.08: 900.0 * np.eye(2), 1.12: 800.0 * np.eye(2)}
