@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Format identified parameters as text, tables for the terminal, and JSON."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from math import isfinite
 from pathlib import Path
@@ -157,7 +157,20 @@ def _stiffness_text(summary: StiffnessSummary) -> str:
         f'{result.symbol} = {measured(result.mean, result.error, result.unit)}, '
         f'95 % interval {between(result.interval)}'
     )
-    return '\n\n'.join(filter(None, [matrices, intervals, predictions, stiffness]))
+    return '\n\n'.join(
+        filter(None, [matrices, intervals, predictions, _spring_lines(summary), stiffness])
+    )
+
+
+def _spring_lines(summary: StiffnessSummary) -> str:
+    """Return whether the places are springs, one sentence of each group."""
+    places = short_names([one.name for one in summary.estimates])
+    at = [
+        (f'{places[one.name]}, {level.force:.2f} N', level.words)
+        for one in summary.estimates
+        for level in one.levels
+    ]
+    return '\n'.join(_grouped(at, {})[0])
 
 
 def warned(summary: Summary, origin: Origin) -> tuple[list[str], list[str]]:
@@ -166,6 +179,13 @@ def warned(summary: Summary, origin: Origin) -> tuple[list[str], list[str]]:
     found = [('', words) for words in summary.warnings]
     found += origin.lost
     found += [(one.name, words) for one in summary.estimates for words in one.warnings]
+    return _grouped(found, names)
+
+
+def _grouped(
+    found: Iterable[tuple[str, str]], names: Mapping[str, str]
+) -> tuple[list[str], list[str]]:
+    """Return one sentence of each group that differs in numbers only, and all sentences."""
     groups: dict[str, list[str]] = {}
     for name, words in found:
         kind = _NUMBERS.sub('', words.partition(' (')[0])

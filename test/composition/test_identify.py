@@ -275,7 +275,8 @@ def test_stiffness_table_has_a_column_per_force_as_table_2(
 ) -> None:
     """Each entry of the matrix at each force, and k_a at the largest force."""
     out, _ = identify(capsys, 'stiffness', *places)
-    matrices, intervals, predicted, result = out.strip().split('\n\n')
+    matrices, intervals, predicted, spring, result = out.strip().split('\n\n')
+    assert re.match('place_1, 1.10 N: a spring: antisymmetric part .*; 3 more like it$', spring)
     assert re.findall(r'^1\.\d\d N: force of a recording', predicted, re.MULTILINE)
     assert re.split(r' {2,}', matrices.splitlines()[0])[1:] == ['1.10 N', '1.50 N']
     assert re.findall(r'^1\.\d\d N', intervals, re.MULTILINE) == ['1.10 N', '1.50 N']
@@ -316,6 +317,21 @@ def test_plane_of_the_presses_can_be_selected(
     assert found['k_xz']['mean'] == pytest.approx(-k[1, 0], abs=5.0)
     _, err = identify(capsys, 'stiffness', *places, '--axes', 'x', status=2)
     assert '--axes must name two axes' in err
+
+
+def test_rotated_axes_of_the_force_are_named(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """In the terminal and in JSON, for each force or for forces alike."""
+    path, angle = str(tmp_path / 'place'), 0.3
+    c, s = np.cos(angle), np.sin(angle)
+    write_presses(Path(path), turn_force=((c, -s), (s, c)))
+    out, _ = identify(capsys, 'stiffness', path)
+    (told,) = re.findall(r'^place, 1\.10 N: not a spring unless .* rotation of (\S+) ', out, re.M)
+    # Without the rotation the presses have a curl of -20 N/m in 2270 N/m, -0.5 degrees.
+    assert float(told) == pytest.approx(np.degrees(angle - 20.0 / 2270.0), abs=0.2)
+    (one,) = as_json(capsys, 'stiffness', path)['estimates']
+    assert all('not a spring unless' in level['words'] for level in one['levels'])
 
 
 def test_presses_with_a_reversed_force_are_rejected(
