@@ -77,8 +77,12 @@ def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) 
     after = np.append(first[1:], len(time))
     means = np.add.reduceat(channels, first) / (after - first)[:, np.newaxis]
     shortest = max(2, ceil((settings.hold_time + settings.settle_time) / width))
+    # Second differences of ramps vanish; noise scatters by its standard deviation times root 6.
+    bends = np.abs(np.diff(means[:, :2], n=2, axis=0, prepend=means[:1, :2]))
+    noise = float(np.median(bends)) / (0.6745 * sqrt(6.0))
+    band = max(settings.level_tolerance, _BAND * noise)
     runs, parts = [], []
-    for start, length in _steady_runs(number, means[:, :4], settings.level_tolerance, shortest):
+    for start, length in _steady_runs(number, means[:, :4], band, shortest):
         begin = int(np.searchsorted(time, time[first[start]] + settings.settle_time))
         end = int(after[start + length - 1])
         if end - begin >= _FEWEST_SAMPLES:
@@ -94,27 +98,24 @@ def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) 
     middle = np.array([time[begin:end].mean() for begin, end in parts])
     zero = np.column_stack([np.interp(time[first], middle[rest], c) for c in mean[rest, :2].T])
     size = np.hypot(*(means[:, :2] - zero).T)
-    pressed = size > settings.rest_force
+    pressed = size > max(settings.rest_force, noise)
     in_hold = np.zeros(len(means), dtype=np.bool_)
     for (start, length), is_rest in zip(runs, rest, strict=True):
         in_hold[start : start + length] = not is_rest
     edges = np.flatnonzero(np.diff(np.pad(pressed.astype(np.int8), 1))).reshape(-1, 2)
-    # Noise may cross the limit of a rest repeatedly, but not twice the limit.
-    high = size > 2.0 * settings.rest_force
+    # Noise may cross the limit of a rest repeatedly, but not twice the limit or half its band.
+    high = size > max(2.0 * settings.rest_force, 0.5 * _BAND * noise)
     missed = sum(high[up:down].any() and not in_hold[up:down].any() for up, down in edges)
     trend = np.array([_line(channels[begin:end]) for begin, end in parts])
     return Plateaus(middle, mean, _variances(channels, parts), trend, rest, missed)
 
 
 def _steady_runs(
-    number: IntArray, means: FloatArray, tolerance: float, shortest: int
+    number: IntArray, means: FloatArray, band: float, shortest: int
 ) -> list[tuple[int, int]]:
     """Return (start, length) of the longest steady runs of bins without overlap."""
     if len(means) < shortest:
         return []
-    # Second differences of ramps vanish; noise scatters by its standard deviation times root 6.
-    noise = np.median(np.abs(np.diff(means[:, :2], n=2, axis=0, prepend=means[:1, :2])))
-    band = max(tolerance, _BAND * float(noise) / (0.6745 * sqrt(6.0)))
     motion = float(np.ptp(means[:, 2:], axis=0).max()) * _STEADY_MOTION
     scaled = means / [band, band, motion or 1.0, motion or 1.0]
     gap = np.concatenate([[0], np.cumsum(np.diff(number) > _GAP)])

@@ -397,6 +397,20 @@ def test_a_press_without_a_hold_is_discarded_and_reported() -> None:
     assert_allclose(estimate.levels[0].matrix, TABLE[1.3], rtol=1e-6)
 
 
+@pytest.mark.parametrize('shaken', [False, True])
+def test_presses_are_counted_in_noise_above_the_limit_of_a_rest(shaken: bool) -> None:
+    """Noise of 0.2 N crosses 0.1 N hundreds of times; a press without a hold is one."""
+    exact = pressed(TABLE[1.3], grid((5.0,)), hold=1.0, rest=1.0)
+    force = exact.force + 0.2 * np.random.default_rng(1).normal(size=exact.force.shape)
+    if shaken:
+        hold = np.abs(exact.time - 1.7) < 0.5
+        force[hold] *= 1.0 + 0.8 * np.sin(2.0 * np.pi * 8.0 * exact.time[hold, np.newaxis])
+    estimate = identify_stiffness(replace(exact, force=force))
+    assert estimate.levels[0].presses == 8 - shaken
+    missed = [words for words in estimate.warnings if 'left out' in words]
+    assert [words.partition(',')[0] for words in missed] == ['presses left out: 1'] * shaken
+
+
 UNKNOWN_FROM_X = (
     'k_xz',
     'k_zz',
