@@ -27,7 +27,14 @@ LOST: Final = 'messages lost'  #: key of the metadata for the messages that the 
 
 _FORMS: Final = ('.mcap', '.db3', '.bag')
 
-_VALID: Final = 'valid: a rosbag2 folder, an .mcap or a .db3 file, or a .bag file of ROS 1'
+#: Suffixes of tables, which take the place of a bag in some identifications.
+MATLAB: Final = '.mat'
+TABLES: Final = ('.csv', '.tsv', '.txt', '.dat', MATLAB)
+
+_VALID: Final = (
+    'valid: a rosbag2 folder, an .mcap or a .db3 file, or a .bag file of ROS 1; for friction, '
+    f'steering and sensor also a table ({", ".join(TABLES)})'
+)
 
 _WINDOW: Final = 2**22  # size of the buffer for sorting messages by receive time [bytes]
 

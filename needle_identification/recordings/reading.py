@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
-from needle_identification.bags.bag import Bag
+from needle_identification.bags.bag import Bag, TABLES
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import samples, tables, TIMES
@@ -129,9 +129,7 @@ def read_friction_recording(
                 raise RecordingError(f'{path} is a table: --columns takes the place of {option}')
         return tables.friction_recording(tables.read_table(Path(path)), columns or {})
     if columns:
-        raise RecordingError(
-            f'{path} is a bag: --columns is for tables ({", ".join(tables.TABLES)})'
-        )
+        raise RecordingError(f'{path} is a bag: --columns is for tables ({", ".join(TABLES)})')
     sign, axis = signed_axis(force_axis, 'force axis')
     bag = Bag(path)
     topics = bag.topics()

@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 import zlib
 
 from needle_dynamics.arrays import FloatArray, IntArray
-from needle_identification.bags.bag import form_of, METADATA
+from needle_identification.bags.bag import form_of, MATLAB, METADATA, TABLES
 from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import integrated, Recording
@@ -38,10 +38,6 @@ from needle_identification.recordings.units import (
 from needle_ros.errors import shown
 from needle_ros.quantities import signed
 import numpy as np
-
-#: Suffixes of table files.
-MATLAB: Final = '.mat'
-TABLES: Final = ('.csv', '.tsv', '.txt', '.dat', MATLAB)
 
 ROLES: Final = ('time', 'depth', 'speed', 'force')  #: for friction; depth or speed is sufficient
 

@@ -40,16 +40,16 @@ class _Recordings(Action):
         setattr(options, self.dest, [one for path in values for one in recordings_in(path)])
 
 
-def add_recordings(parser: ArgumentParser, otherwise: str = '') -> None:
-    """Add the argument of recordings; ``otherwise`` ends its help."""
+def add_recordings(parser: ArgumentParser, otherwise: str = '', *, tables: bool = True) -> None:
+    """Add the argument of recordings, with or without tables; ``otherwise`` ends its help."""
+    kinds = 'rosbag2 folder, .mcap, .db3 or ROS 1 .bag file'
     parser.add_argument(
         'recordings',
         type=Path,
         nargs='+',
         action=_Recordings,
         metavar='RECORDING',
-        help='rosbag2 folder, .mcap, .db3 or ROS 1 .bag file, table (.csv, .tsv, .mat), or a '
-        f'folder of these{otherwise}',
+        help=f'{kinds}{", table (.csv, .tsv, .mat)" * tables}, or a folder of these{otherwise}',
     )
 
 

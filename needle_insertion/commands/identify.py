@@ -114,7 +114,8 @@ def _add_common(
     defaults: identification.FrictionSettings | identification.StiffnessSettings,
 ) -> tuple[argparse._ArgumentGroup, argparse._ArgumentGroup]:
     """Add the options of all kinds; return the option groups of reading and of fitting."""
-    common.add_recordings(parser, common.SKIPPED)
+    tables = isinstance(defaults, identification.FrictionSettings)
+    common.add_recordings(parser, common.SKIPPED, tables=tables)
     writing = parser.add_argument_group('output')
     common.add_output(writing)
     writing.add_argument(

@@ -289,6 +289,17 @@ def test_stiffness_table_has_a_column_per_force_as_table_2(
     assert result.startswith('k_a = 5')
 
 
+@pytest.mark.parametrize('what', ['friction', 'stiffness', 'steering'])
+def test_the_help_lists_tables_where_they_are_read(
+    capsys: pytest.CaptureFixture[str], what: str
+) -> None:
+    """Presses are read from bags only."""
+    with pytest.raises(SystemExit):
+        main(['identify', what, '--help'])
+    (recordings,) = re.findall(r'RECORDING  .*?status', capsys.readouterr().out, re.DOTALL)
+    assert ('.csv' in recordings) == (what != 'stiffness')
+
+
 def test_force_level_of_the_result_can_be_selected(
     capsys: pytest.CaptureFixture[str], places: list[str], tmp_path: Path
 ) -> None:
