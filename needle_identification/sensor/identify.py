@@ -25,6 +25,7 @@ from needle_identification.estimation.estimate import (
 from needle_identification.estimation.regression import DEVIATION_OVER_MEDIAN
 from needle_identification.recordings.recording import SensorRecording
 from needle_identification.recordings.samples import are_gaps
+from needle_identification.sensor.checks import axis_warnings, EXACT, measured_rows
 from needle_identification.sensor.noise import (
     binomial_interval,
     fit_losses,
@@ -38,7 +39,6 @@ from scipy.ndimage import median_filter
 from scipy.special import stdtrit
 
 _LEAST: Final = 50  # smallest number of samples
-_EXACT: Final = 1e-9  # largest change of errors that are rounding [m]
 _WINDOW: Final = 11  # samples of a running median
 _FAR: Final = 6.0  # deviation of an outlier [robust standard deviations]
 _DELAYS: Final = (-0.2, 1.0)  # range of the delay [s]
@@ -96,7 +96,8 @@ def identify_sensor(recording: SensorRecording) -> SensorEstimate:
         If there are too few samples, or if units or axes do not match.
 
     """
-    one = recording
+    kept, lost = measured_rows(recording.tip)
+    one = replace(recording, time=recording.time[kept], tip=recording.tip[kept])
     if not one.moves:
         mean = one.true_tip.mean(axis=0, keepdims=True)
         one = replace(one, true_time=one.true_time[:1], true_tip=mean)
@@ -106,7 +107,7 @@ def identify_sensor(recording: SensorRecording) -> SensorEstimate:
     delay, time = _aligned(one, usable), one.time[usable]
     errors = one.tip[usable] - _true(one, time - delay)
     for axis, column in zip(one.axes, errors.T, strict=True):
-        if np.ptp(column) < _EXACT:
+        if np.ptp(column) < EXACT:
             raise IdentificationError(
                 f'{one.name}: the error along {axis} does not vary, {column[0]:.3g} m in all '
                 'samples: leave this axis out with --axes'
@@ -122,6 +123,8 @@ def identify_sensor(recording: SensorRecording) -> SensorEstimate:
     between = binomial_interval(count, len(far))
     outliers = estimated('outliers', 'p_o', '1', fraction, error, between)
     noise = (*_noise(fit), *_biases(one, fit), _delay(one, fit, delay))
+    doubts = _warnings(fit, duration, isfinite(dropout.value))
+    left = tip - _true(one, time - delay)
     return SensorEstimate(
         name=one.name,
         axes=one.axes,
@@ -129,7 +132,7 @@ def identify_sensor(recording: SensorRecording) -> SensorEstimate:
         rate=1.0 / float(np.median(np.diff(one.time))),
         samples=len(one.time),
         duration=duration,
-        warnings=tuple(_warnings(fit, duration, isfinite(dropout.value))),
+        warnings=(*lost, *doubts, *axis_warnings(one.axes, time, tip, left, fit)),
     )
 
 

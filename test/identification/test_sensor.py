@@ -8,6 +8,7 @@ from dataclasses import replace
 import json
 from math import exp, log, sqrt
 from pathlib import Path
+import re
 from typing import Any, Final
 
 from needle_controller import SteeringPrior
@@ -21,6 +22,7 @@ from needle_identification import (
     RecordingError,
     SensorRecording,
 )
+from needle_identification.sensor.checks import measured_rows
 from needle_identification.sensor.noise import fit_losses, NoiseLikelihood
 from needle_identification.sensor.reading import read_sensor_recording
 from needle_insertion.cli import main
@@ -119,6 +121,52 @@ def test_outliers_are_counted_and_left_out() -> None:
     assert hits >= 90
     # Without 2 % of 6000 values, a deviation differs by 0.13 %: five times that.
     np.testing.assert_allclose(sizes, 1.0, atol=6.5e-3)
+
+
+@pytest.mark.parametrize('kind', ['zero', 'exactly as the one before'])
+def test_lost_tracking_is_as_missing_samples(kind: str) -> None:
+    """Zeros and repeated positions are bursts of losses, to the bit."""
+    clean = recorded(noise=1.8e-4)
+    place = np.arange(len(clean.time))
+    lost = np.isin(place // 40, [7, 21, 40, 63])
+    last = np.maximum.accumulate(np.where(lost, 0, place))
+    tip = np.where(lost[:, np.newaxis], 0.0, clean.tip) if kind == 'zero' else clean.tip[last]
+    found = identify_sensor(changed(clean, tip))
+    missing = identify_sensor(replace(clean, time=clean.time[~lost], tip=clean.tip[~lost]))
+    assert found.parameters == missing.parameters
+    low, high = found['dropout'].interval
+    assert low < lost.mean() < high
+    assert found['dropout_time'].determined
+    assert found.warnings == (f'160 positions are {kind}, in 4 places: counted as lost',)
+
+
+@pytest.mark.parametrize('every', [1.0, 1.5, 2.5])
+@pytest.mark.parametrize('step', [1e-9, 1e-4, 2e-4, 3e-4, 1e-3])
+def test_positions_that_repeat_by_chance_are_measurements(step: float, every: float) -> None:
+    """Those of a coarse sensor, about zero or elsewhere, and of a log at a higher rate."""
+    for seed in range(20):
+        tip = 2e-4 * np.random.default_rng(seed).standard_normal((3000, 3))
+        tip = tip[(np.arange(3000) / every).astype(np.int64)]
+        for axes, center in ((1, 0.0), (1, 2e-3), (3, 0.0), (3, 2e-3)):
+            rows, words = measured_rows(np.round((tip[:, :axes] + center) / step) * step)
+            # By chance in one of a thousand recordings.
+            assert rows.all()
+            assert not words
+
+
+def test_axes_that_differ_and_coarse_steps_are_named() -> None:
+    """One noise for all axes and a mean of rounded positions then have no valid interval."""
+    clean = recorded(noise=1e-4)
+    errors = clean.tip - HELD
+    assert identify_sensor(clean).warnings == ()
+    (words,) = identify_sensor(changed(clean, HELD + errors * [1.0, 1.0, 6.0])).warnings
+    assert re.match('the noise differs between the axes, x 0.09.* mm, y .* mm, z 0.6.* mm', words)
+    for step, coarse in ((1e-4, False), (2e-4, False), (5e-4, True)):
+        # A quarter of 0.5 mm from a step, where the mean is off the most.
+        tip = np.round((clean.tip + 1.25e-4) / step) * step
+        found = identify_sensor(changed(clean, tip))
+        assert len(found.warnings) == coarse
+        assert all('x, y, z are in steps of 0.5 mm, coarse' in one for one in found.warnings)
 
 
 def test_likelihood_equals_that_of_the_dense_covariance() -> None:
