@@ -98,7 +98,9 @@ class InputMonitor:
         age = now - stamp
         if not -self._ahead <= age <= self.timeout:
             if stamp == 0:
-                return Refusal('not stamped', f'{self.name} is stale: it is not stamped')
+                return Refusal(
+                    'not stamped', f'{self.name} is stale: it is not stamped (hardware.stamps)'
+                )
             return Refusal('stale', f'{self.name} is stale: its stamp is {apart(age)}')
         if stamp == self.last:
             return Refusal(REPEATED, f'{self.name} received twice')

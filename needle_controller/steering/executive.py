@@ -401,15 +401,17 @@ class SteeringExecutive(StateMachine[JointMotion]):
             return self._begin_if_planned(now)
         silence = self._joint_stream.silence(now)
         silent = f'no joint_states received within {silence:.2f} s' if silence > timeout else ''
+        disputed = [
+            f'{stream.publishers} nodes publish {stream.name}'
+            for stream in self._streams
+            if stream.publishers > 1
+        ]
         if not self.steers:
             if self._retraction is not None and self._obeyed is Mode.RETRACTING:
-                self._retraction.watch(silent)
+                self._retraction.watch(silent and ', '.join([*disputed, silent]))
             return None
-        for stream in self._streams:
-            if stream.publishers > 1:
-                return self._stop(f'{stream.publishers} nodes publish {stream.name}', now)
-        if silent:
-            return self._stop(silent, now)
+        if disputed or silent:
+            return self._stop(', '.join(disputed) or silent, now)
         return self._run(lambda insertion: insertion.watch(now), now)
 
     def count_publishers(self, joint_states: int, tip_deflection: int) -> None:

@@ -18,7 +18,7 @@ _DESCRIPTIONS: Final = {
     Phase.GUIDING: 'the guide moves',
     Phase.INSERTING: 'the needle is inserted',
     Phase.MEASURING: 'measures the tip',
-    Phase.RETRACTING: 'the needle is withdrawn',
+    Phase.RETRACTING: 'the needle is being withdrawn',
 }
 _SCATTERED: Final = 3.0  #: Multiple of the configured noise of a measurement that is reported.
 

@@ -22,6 +22,7 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 
 BRAKING: Final = 0.2  #: Time in which needle and guide brake to rest after a stop [s].
+_OLD: Final = NANOSECONDS  #: Age of positions at which a robot may be elsewhere [ns].
 _HELD: Final = 6  #: Number of points of a stop: if it arrives within a second, one is not past.
 LAGGING: Final = 5.0  #: Tolerance of a moving joint, as a multiple of its tolerance at rest.
 
@@ -38,6 +39,7 @@ class MotionControl:
         self._settings, self._events = settings, events
         self.monitor = MotionMonitor(settings.joints, settings.tolerances)
         self.at = np.full(len(settings.joints), np.nan)  #: measured positions [m, rad]
+        self._measured = 0  #: their stamp [ns]
         #: Velocity of the needle [m/s]; stamp [ns] and depth [m] from which it is measured.
         self.velocity = 0.0
         self._before: tuple[int, float] | None = None
@@ -64,7 +66,7 @@ class MotionControl:
 
     def measure(self, at: FloatArray, stamp: int) -> None:
         """Take measured positions of the joints [m, rad] with their stamp [ns]."""
-        self.at = at
+        self.at, self._measured = at, stamp
         before = self._before or (stamp, float(at[0]))
         elapsed = (stamp - before[0]) / NANOSECONDS
         if elapsed >= _SPAN:
@@ -169,7 +171,10 @@ class MotionControl:
     def stop(self, now: int) -> JointMotion:
         """Brake needle and guide to rest at their positions, and monitor that they rest."""
         self._halted, self._stops = None, _STOPS
-        return self._send_stop(self._braked(), now)
+        move = self._send_stop(self._braked(), now)
+        if not len(move.times):
+            self.discard_stop()
+        return move
 
     def pause(self, now: int) -> JointMotion:
         """Brake needle and guide to rest at their positions."""
@@ -202,8 +207,10 @@ class MotionControl:
         return self._brake(end, now)
 
     def _brake(self, end: FloatArray, now: int) -> JointMotion:
-        held = np.tile(end, (_HELD, 1))
-        times = BRAKING * np.arange(1.0, _HELD + 1.0)
+        # Without points, the joints brake and hold where they are.
+        count = _HELD if now - self._measured < _OLD else 0
+        held = np.tile(end, (count, 1))
+        times = BRAKING * np.arange(1.0, count + 1.0)
         move = JointMotion(self._settings.joints, times, held, np.zeros_like(held))
         move = self._stamped(move, now)
         self.monitor.forget()
@@ -251,7 +258,7 @@ class Retraction:
     ) -> None:
         self._motions, self._settings, self._events = motions, settings, events
         self.ended, self.failure = False, ''
-        events.add(Severity.INFO, 'the needle is withdrawn')
+        events.add(Severity.INFO, 'the needle is being withdrawn')
         self._begin: FloatArray | None = None  #: positions at the begin [m, rad], shape (joints,)
         self._end = settings.retract_depth  #: depth at the end [m]
         #: Whether another node withdraws the needle; time of the last guide motion then [ns].
@@ -277,7 +284,7 @@ class Retraction:
 
     def watch(self, silent: str) -> None:
         """Process that the positions of the joints are not received, if that is not ''."""
-        if silent and self._begin is not None and not self.ended:
+        if silent and not self.ended:
             self._fail(silent)
 
     def _fail(self, why: str) -> None:

@@ -376,6 +376,38 @@ def test_stop_does_not_advance_a_resting_needle(continuous: bool, silent: bool) 
     assert path[:, 0].max() <= depth + 1e-9
 
 
+@pytest.mark.requirement('S-327')
+@STRATEGIES
+def test_stop_without_recent_positions_moves_nothing(continuous: bool) -> None:
+    """A robot that has restarted elsewhere gets no positions from before."""
+    robot = inserted(continuous, 0.021)
+    robot.says = lambda _at: None
+    robot.tick(100)
+    assert robot.loop.authority.reason
+    for k, position in enumerate((0.01, 0.0, 0.0)):
+        robot.ways[k] = np.zeros(1), np.array([position])
+    robot.tick(200)
+    assert robot.request(CLEAR_STOP)
+    assert robot.request(RETRACT)
+    assert robot.request(STOP)
+    assert_allclose(positions(robot, 300), np.tile([0.01, 0.0, 0.0], (300, 1)))
+
+
+@pytest.mark.requirement('S-267')
+def test_retraction_without_joint_states_is_reported() -> None:
+    """Also one that has not begun."""
+    robot = inserted(False, 0.021)
+    assert robot.request(STOP)
+    robot.tick(100)
+    robot.says = lambda _at: None
+    robot.tick(100)
+    assert robot.request(CLEAR_STOP)
+    assert robot.request(RETRACT)
+    robot.tick(20)
+    _, line, _ = robot.loop.diagnose(robot.now)
+    assert line.startswith('the retraction has failed: no joint_states received within ')
+
+
 @pytest.mark.requirement('S-016')
 def test_lost_joint_states_do_not_advance_the_needle_beyond_its_motion() -> None:
     """The stop is at the last measured position and its braking distance."""

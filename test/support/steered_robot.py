@@ -130,6 +130,7 @@ class Robot:
             times = self.now + 1e9 * np.concatenate([[0.0], move.times])
             for joint in own if not why else ():
                 k, column = NAMES.index(joint), move.positions[:, move.joints.index(joint)]
+                # Without points it holds.
                 self.ways[k] = times, np.concatenate([[self.at[k]], column])
                 self.begun.append(move.stamp)
         self.report()
