@@ -670,7 +670,10 @@ def test_wrong_rate_is_reported(ros_graph: RosGraph) -> None:
 @pytest.mark.requirement('S-111')
 @pytest.mark.parametrize(
     ('stamps', 'said'),
-    [('header', 'joint_states is stale: it is not stamped'), ('receive', 'active')],
+    [
+        ('header', 'joint_states is stale: it is not stamped (hardware.stamps)'),
+        ('receive', 'active'),
+    ],
 )
 def test_unstamped_messages_need_arrival_time(ros_graph: RosGraph, stamps: str, said: str) -> None:
     """They are rejected unless the time of arrival is configured."""
