@@ -4,18 +4,24 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, islice
 from math import nan
 from pathlib import Path
 import shlex
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray, IntArray
+from needle_dynamics.arrays import FloatArray
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError, WrongSignError
 from needle_identification.recordings import reading, tables
-from needle_identification.recordings.samples import are_gaps, EachJoint, Gathering, source_of
+from needle_identification.recordings.samples import (
+    are_gaps,
+    EachJoint,
+    Gathering,
+    Samples,
+    source_of,
+)
 from needle_identification.steering.reading import (
     check_depth,
     is_inverted,
@@ -28,6 +34,7 @@ from needle_identification.steering.reading import (
 )
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_ros import wire
+from needle_ros.contract import INSERTION
 from needle_ros.errors import NeedleError
 from needle_ros.quantities import AXES
 import numpy as np
@@ -59,7 +66,7 @@ class Content:
     name: str  #: of the topic, or of the file
     type_name: str  #: of the messages, or ``table``
     count: int  #: number of messages or rows
-    rate: float = nan  #: messages per second, from the median step; nan if not inspected
+    rate: float = nan  #: messages per second, without pauses; nan if not inspected
     gaps: int = 0  #: number of pauses of more than ten steps
     columns: tuple[ColumnSummary, ...] = ()  #: components; none if the type is not supported
 
@@ -182,62 +189,90 @@ def _column(name: str, values: FloatArray) -> ColumnSummary:
 
 
 class _Signal(NamedTuple):
-    """A component of a topic over time: stamps [ns], values in SI units."""
+    """A component of a topic over time, in SI units."""
 
     topic: BagTopic
     axis: str
-    stamps: IntArray
-    values: FloatArray
+    samples: Samples  # values (n,)
+
+    @property
+    def values(self) -> FloatArray:
+        return self.samples.values
+
+    @property
+    def varies(self) -> bool:
+        return bool(np.isfinite(self.values).all() and np.ptp(self.values) > 0.0)
 
 
 def _bag(path: Path) -> Inspection:
     bag = Bag(path)
-    topics = [topic for topic in bag.topics() if topic.type_name in (*reading.MOTIONS, *_FORCE)]
-    read: dict[BagTopic, list[str]] = {}
-    gathered: dict[BagTopic, Gathering] = {}
-    for topic in topics:
-        axes, source = list(AXES), source_of(topic.type_name, AXES)
-        if topic.type_name == wire.JOINT_STATE:
-            names = dict.fromkeys(chain.from_iterable(reading.first_names(bag, topic)))
-            axes = list(names)[:_MAX_JOINTS]
-            source = EachJoint(*axes)
-        if axes:
-            read[topic], gathered[topic] = axes, Gathering(topic, source, by_header=True)
+    gathered = {
+        topic: _gatherings(bag, topic)
+        for topic in bag.topics()
+        if topic.type_name in (*reading.MOTIONS, *_FORCE)
+    }
     for batch in bag.batches(lambda topic: topic in gathered):
-        gathered[batch.topic].add(batch)
+        for gathering in gathered[batch.topic].values():
+            gathering.add(batch)
     contents, signals = [], []
     losses = list(bag.losses)
     for topic, count in sorted(bag.counts.items(), key=lambda item: item[0].name):
         content = Content(name=topic.name, type_name=topic.type_name, count=count)
-        if topic in gathered:
-            bag.losses.clear()
-            try:
-                samples = gathered[topic].samples(bag)
-            except RecordingError as error:
-                losses.append(str(error))
-            else:
-                losses += bag.losses
-                columns = dict(zip(read[topic], samples.values.T, strict=True))
-                steps = np.diff(samples.stamps)
-                rate, gaps = 1e9 / np.median(steps), np.count_nonzero(are_gaps(steps))
-                found = tuple(_column(axis, values) for axis, values in columns.items())
-                content = replace(content, rate=float(rate), gaps=int(gaps), columns=found)
-                signals += [
-                    _Signal(topic, axis, samples.stamps, values)
-                    for axis, values in columns.items()
-                    if np.isfinite(values).all() and np.ptp(values) > 0.0
-                ]
+        if read := _signals(bag, topic, gathered.get(topic, {}), losses):
+            steps = np.diff(max((one.samples.stamps for one in read), key=len))
+            gaps = are_gaps(steps)
+            content = replace(
+                content,
+                rate=float(1e9 * (count - 1) / steps[~gaps].sum()),
+                gaps=int(np.count_nonzero(gaps)),
+                columns=tuple(_column(one.axis, one.values) for one in read),
+            )
+            signals += read
         contents.append(content)
-    words, command = _steered(path, signals)
+    varying = [one for one in signals if one.varies]
+    words, command = _steered(path, varying)
     if not command:
-        words, command = _suggestion(path, signals)
+        components = {topic: len(list(chain(*parts))) for topic, parts in gathered.items()}
+        words, command = _suggestion(path, varying, components)
     if not command:
         with suppress(NeedleError):
             words, command = _pressed(path)
     return Inspection(
-        path=str(path), contents=tuple(contents), losses=tuple(losses), words=tuple(words),
-        command=command,
+        path=str(path), contents=tuple(contents), losses=tuple(dict.fromkeys(losses)),
+        words=tuple(words), command=command,
     )  # fmt: skip
+
+
+def _gatherings(bag: Bag, topic: BagTopic) -> dict[tuple[str, ...], Gathering]:
+    """Return what gathers all axes of a topic, or each of its joints, by their names."""
+    if topic.type_name != wire.JOINT_STATE:
+        return {AXES: Gathering(topic, source_of(topic.type_name, AXES), by_header=True)}
+    names = dict.fromkeys(chain.from_iterable(reading.first_names(bag, topic)))
+    # One by one: other publishers have other joints, and a joint may have no numbers.
+    return {
+        (name,): Gathering(topic, EachJoint(name, required=1), by_header=True)
+        for name in islice(names, _MAX_JOINTS)
+    }
+
+
+def _signals(
+    bag: Bag, topic: BagTopic, gathered: Mapping[tuple[str, ...], Gathering], losses: list[str]
+) -> list[_Signal]:
+    """Return all components of a topic that are readable; add what was lost."""
+    found = []
+    for axes, gathering in gathered.items():
+        bag.losses.clear()
+        try:
+            samples = gathering.samples(bag)
+        except RecordingError as error:
+            losses.append(str(error))
+            continue
+        losses += bag.losses
+        found += [
+            _Signal(topic, axis, samples._replace(values=values))
+            for axis, values in zip(axes, samples.values.T, strict=True)
+        ]
+    return found
 
 
 def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
@@ -277,8 +312,14 @@ def _pressed(path: Path) -> tuple[list[str], str]:
     return [what], shlex.join(['needle', 'identify', 'stiffness', str(path)])
 
 
-def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
-    """Find the pair of force and motion that is most similar to friction."""
+def _suggestion(
+    path: Path, signals: Sequence[_Signal], components: Mapping[BagTopic, int]
+) -> tuple[list[str], str]:
+    """
+    Find the pair of force and motion that is most similar to friction.
+
+    `components` is the number of axes or joints of each topic, also of those at rest.
+    """
     forces = [one for one in signals if one.topic.type_name in _FORCE]
     motions = [one for one in signals if one.topic.type_name in reading.MOTIONS]
     pairs = [(*_friction(force, motion), force, motion) for force in forces for motion in motions]
@@ -296,20 +337,23 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
         f'{100.0 * explained:.0f} % of the force'
     )
     words = [what]
+    if loss := reading.clock_offset(force.samples, motion.samples)[1]:
+        words.append(loss)
     options = []
-    if len({one.topic for one in forces}) > 1:
-        options += ['--wrench-topic', force.topic.name]
-    if len({one.topic for one in motions}) > 1:
-        options += ['--motion-topic', motion.topic.name]
+    for option, one, types in (
+        ('--wrench-topic', force, _FORCE),
+        ('--motion-topic', motion, reading.MOTIONS),
+    ):
+        if len([topic for topic in components if topic.type_name in types]) > 1:
+            options += [option, one.topic.name]
     axis = force.axis
     if size < 0.0:
         words.append('the force is opposite to the motion: sign reversed')
         axis = f'-{axis}'
     if axis != 'y':
         options += ['--force-axis', axis]
-    is_joint = motion.topic.type_name == wire.JOINT_STATE
-    others = [one for one in motions if one.topic == motion.topic]
-    if (is_joint and len(others) > 1) or (not is_joint and motion.axis != 'y'):
+    usual = INSERTION if motion.topic.type_name == wire.JOINT_STATE else 'y'
+    if motion.axis != usual and components[motion.topic] > 1:
         options += ['--motion-axis', motion.axis]
     command = shlex.join(['needle', 'identify', 'friction', str(path), *options])
     return words, command
@@ -317,15 +361,16 @@ def _suggestion(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]
 
 def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
     """Return the fraction of a force explained by Coulomb and viscous friction, and mu_s [N]."""
-    start = max(force.stamps[0], motion.stamps[0])
-    end = min(force.stamps[-1], motion.stamps[-1])
+    offset, _ = reading.clock_offset(force.samples, motion.samples)
+    stamps, moved = force.samples.stamps - offset, motion.samples.stamps
+    start, end = max(stamps[0], moved[0]), min(stamps[-1], moved[-1])
     if end <= start:
         return 0.0, 0.0
-    every = max(1, len(motion.stamps) // _TRIED)
-    time = 1e-9 * (motion.stamps[::every] - start)
+    every = max(1, len(moved) // _TRIED)
+    time = 1e-9 * (moved[::every] - start)
     values = motion.values[::every]
     velocity = values if motion.topic.type_name in _VELOCITIES else np.gradient(values, time)
-    read = np.interp(time, 1e-9 * (force.stamps - start), force.values)
+    read = np.interp(time, 1e-9 * (stamps - start), force.values)
     moving = np.abs(velocity) > _MOVING * np.quantile(np.abs(velocity), 0.99)
     moving &= (time >= 0.0) & (time <= 1e-9 * (end - start))
     if np.count_nonzero(moving) < 10:

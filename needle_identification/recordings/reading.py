@@ -316,7 +316,8 @@ def merge(
     bag: SampleOrigin, force: Samples, motion: Samples
 ) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return time [s], force, motion at the stamps of the force, and its clock offset [s]."""
-    offset = _clock_offset(bag, force, motion)
+    offset, loss = clock_offset(force, motion)
+    bag.losses += [loss] * bool(loss)
     stamps = force.stamps - offset
     covered = _covered(stamps, motion.stamps)
     if np.count_nonzero(covered) < 2:
@@ -338,24 +339,22 @@ def merge(
     return time, force.values[covered][distinct], np.column_stack(columns), offset * 1e-9
 
 
-def _clock_offset(bag: SampleOrigin, force: Samples, motion: Samples) -> int:
-    """Estimate the clock offset of force to motion [ns]; 0 if explained by latency."""
+def clock_offset(force: Samples, motion: Samples) -> tuple[int, str]:
+    """Estimate the clock offset of force to motion [ns], 0 if explained by latency; and a loss."""
     quantiles = [
         np.quantile(samples.latency, (0.05, 0.5), method='lower') for samples in (force, motion)
     ]
     (force_low, force_mid), (motion_low, motion_mid) = quantiles
     offset = int(motion_low - force_low)
-    variation = float(force_mid - force_low) + float(motion_mid - motion_low)
-    words = f'by the receive times {force.topic} is stamped {offset * 1e-9:.3f} s'
-    if abs(offset) > max(1e9 * LARGEST_LATENCY, _CERTAINTY * variation):
-        bag.losses.append(f'{words} after {motion.topic}: clocks differ, corrected')
-        return offset
-    if abs(offset) > max(1e9 * _NOTABLE_LATENCY, _CERTAINTY * variation):
-        bag.losses.append(
-            f'{words} after {motion.topic}: may be latency, not corrected; time receive would '
-            'correct it'
+    variation = _CERTAINTY * (float(force_mid - force_low) + float(motion_mid - motion_low))
+    words = f'by the receive times {force.topic} is stamped {offset * 1e-9:.3f} s after '
+    if abs(offset) > max(1e9 * LARGEST_LATENCY, variation):
+        return offset, f'{words}{motion.topic}: clocks differ, corrected'
+    if abs(offset) > max(1e9 * _NOTABLE_LATENCY, variation):
+        return 0, (
+            f'{words}{motion.topic}: may be latency, not corrected; time receive would correct it'
         )
-    return 0
+    return 0, ''
 
 
 def _covered(stamps: IntArray, motion: IntArray) -> BoolArray:

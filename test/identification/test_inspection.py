@@ -6,8 +6,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 import shlex
+from typing import Any
 
-from needle_identification import inspect_recording, RecordingError
+from needle_identification import BagWriter, inspect_recording, RecordingError
 from needle_identification.recordings.tables import column_roles
 from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
 from needle_insertion.cli import main
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import get_typestore, Stores
+from support.samples import EPOCH, header, STORE, wrench
 from support.steered_recording import recorded_plant
 from support.strokes import strokes
 
@@ -88,6 +90,64 @@ def ros1(path: Path, *, axis: int = 2, sign: float = -1.0) -> Path:
             ):  # fmt: skip
                 writer.write(connection, stamp, ROS1.serialize_ros1(message, kind))
     return path
+
+
+#: Joints of each publisher; the rail moves.
+ONE_ROBOT, TWO_ROBOTS = (('rail', 'roll', 'grip'),), (('rail',), ('arm_1', 'arm_2'))
+
+
+def lab(
+    path: Path,
+    robots: tuple[tuple[str, ...], ...] = ONE_ROBOT,
+    ahead: int = 0,
+    resting: tuple[str, ...] = (),
+) -> Path:
+    """Write joints, a force at 1 kHz whose clock is ahead [ns], and sensors at rest by topic."""
+    made = strokes(seed=1, push=0.0)
+    with BagWriter(path) as bag:
+        for topic, kind in (('/ft', WRENCH), ('/joints', JOINTS), *((t, WRENCH) for t in resting)):
+            bag.add_topic(topic, kind)
+        stamps = EPOCH + np.rint(1e9 * made.time).astype(np.int64)
+        for stamp, depth, force in zip(stamps.tolist(), made.depth, made.force, strict=True):
+            for k in range(4):
+                at = stamp + k * 1_000_000
+                bag.write('/ft', wrench(at + ahead, force), at)
+            for names in robots:
+                message = STORE.types[JOINTS](
+                    header(stamp), list(names),
+                    np.array([depth if name == 'rail' else 0.1 for name in names]),
+                    np.array([]), np.array([]),
+                )  # fmt: skip
+                bag.write('/joints', bytes(STORE.serialize_cdr(message, JOINTS)), stamp)
+            for topic in resting:
+                bag.write(topic, wrench(stamp, 0.0), stamp)
+    return path
+
+
+@pytest.mark.parametrize(
+    ('content', 'options'),
+    [
+        ({}, '--motion-axis rail'),
+        ({'robots': (('rail',),), 'resting': ('/other',)}, '--wrench-topic /ft'),
+        ({'robots': TWO_ROBOTS}, '--motion-axis rail'),
+        ({'ahead': 3_000_000_000}, '--motion-axis rail'),
+    ],
+    ids=['joints at rest', 'sensor at rest', 'two publishers', 'clocks'],
+)
+def test_the_suggested_command_succeeds_with_others_at_rest(
+    tmp_path: Path, content: dict[str, Any], options: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """And with two publishers on a topic, and with clocks 3 s apart."""
+    found = inspect_recording(lab(tmp_path / 'bag', **content))
+    assert found.command == f'needle identify friction {tmp_path / "bag"} {options}'
+    assert found.losses == ()
+    assert any('clocks differ' in one for one in found.words) == ('ahead' in content)
+    rates = {one.name: one.rate for one in found.contents}
+    # Messages, not the averages of 2.5 ms that are kept of a fast topic.
+    assert rates['/ft'] == pytest.approx(1000.0, rel=1e-2)
+    assert rates['/joints'] == pytest.approx(250.0 * len(content.get('robots', '1')), rel=1e-2)
+    assert run(found.command) == 0
+    assert '0.56' in capsys.readouterr().out
 
 
 def run(command: str) -> int:
