@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Inspect a recording: list its content, find force and motion, suggest a command."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain, islice
@@ -15,6 +15,8 @@ from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError, WrongSignError
 from needle_identification.recordings import reading, tables
+from needle_identification.recordings.likeness import Likeness, likeness, velocity_of
+from needle_identification.recordings.recording import Recording
 from needle_identification.recordings.samples import (
     are_gaps,
     EachJoint,
@@ -41,14 +43,13 @@ import numpy as np
 
 _FORCE: Final = (wire.WRENCH,)  # message types of forces
 _VELOCITIES: Final = (wire.TWIST,)  # message types of velocities
-_MOVING: Final = 0.05  # smallest speed in motion, as a fraction of the largest speed
 _EXPLAINED: Final = 0.3  # smallest part of a force that is like friction
+_UNSIGNED: Final = 'the motion does not reverse: the sign of the force cannot be found'
 
 #: Least motion of a steered insertion, by role [m, rad].
 _STEERED: Final = {'guide_x': 2e-4, 'guide_z': 2e-4, 'roll': 0.1}
 
 _MAX_JOINTS: Final = 64  # largest number of joints of a topic that are inspected
-_TRIED: Final = 20_000  # largest number of samples on which a pair of force and motion is fitted
 
 
 class ColumnSummary(NamedTuple):
@@ -135,18 +136,22 @@ def _table(path: Path) -> Inspection:
     if steerable and (lacking or _guide_moves(table, steered)):
         words = [f'{role} by name and values: {spec}' for role, spec in steered.items()]
         kind, columns_of = 'steering', steered
-        unknown = _refusal(table, steered, lambda: check_depth(table, steered['depth']))
+        unknown = _refusal(table, steered)
     elif lacking:
         unknown = f'no column looks like {" or ".join(lacking)}: name them with --columns'
         columns_of = {role: roles.get(role, 'NAME') for role in tables.ROLES if role != 'speed'}
-    elif _is_reversed(table, roles):
-        columns_of = {
-            role: f'-{spec}' if role in ('depth', 'speed') else spec
-            for role, spec in roles.items()
-        }
-        words.append('motion reversed: the force of friction has the sign of the velocity')
     else:
-        unknown = _refusal(table, roles)
+        try:
+            sense = _sense(tables.friction_recording(table, roles))
+        except RecordingError as error:
+            unknown, sense = _reason(table, error), 1.0
+        if sense < 0.0:
+            columns_of = {
+                role: f'-{spec}' if role in ('depth', 'speed') else spec
+                for role, spec in roles.items()
+            }
+            words.append('motion reversed: the force of friction has the sign of the velocity')
+        words += [_UNSIGNED] * (not sense)
     words += [unknown] * bool(unknown)
     named = ','.join(f'{role}={spec}' for role, spec in columns_of.items())
     return Inspection(
@@ -156,27 +161,23 @@ def _table(path: Path) -> Inspection:
     )  # fmt: skip
 
 
-def _refusal(
-    table: tables.Table, columns: Mapping[str, str], check: Callable[[], None] = lambda: None
-) -> str:
-    """Return why columns, such as of unknown unit, are not usable, or ''."""
+def _refusal(table: tables.Table, columns: Mapping[str, str]) -> str:
+    """Return why columns of a steered insertion are not usable, such as by their unit, or ''."""
     try:
-        check()
+        check_depth(table, columns['depth'])
         for role, spec in columns.items():
             tables.column_values(table, role, spec, [])
     except RecordingError as error:
-        return str(error).removeprefix(f'{table.path}: ')
+        return _reason(table, error)
     return ''
 
 
-def _is_reversed(table: tables.Table, roles: Mapping[str, str]) -> bool:
-    """Return whether the force opposes the motion of the base."""
-    try:
-        read = tables.friction_recording(table, roles)
-    except RecordingError:
-        return False
-    # Without its mean, which is the zero of the sensor.
-    return bool(np.sign(np.diff(read.depth)) @ (read.force - read.force.mean())[1:] < 0.0)
+def _reason(table: tables.Table, error: RecordingError) -> str:
+    return str(error).removeprefix(f'{table.path}').lstrip(': ')
+
+
+def _sense(read: Recording) -> float:
+    return likeness(read.time, velocity_of(read.time, read.depth), read.force).sense
 
 
 def _column(name: str, values: FloatArray) -> ColumnSummary:
@@ -322,15 +323,15 @@ def _suggestion(
     """
     forces = [one for one in signals if one.topic.type_name in _FORCE]
     motions = [one for one in signals if one.topic.type_name in reading.MOTIONS]
-    pairs = [(*_friction(force, motion), force, motion) for force in forces for motion in motions]
-    best = max(pairs, key=lambda pair: pair[0], default=None)
-    if best is None or best[0] < _EXPLAINED:
+    pairs = [(_friction(force, motion), force, motion) for force in forces for motion in motions]
+    best = max(pairs, key=lambda pair: pair[0].explained, default=None)
+    if best is None or best[0].explained < _EXPLAINED:
         lacking = [what for what, found in (('force', forces), ('motion', motions)) if not found]
         why = 'no force depends on the direction of a motion'
         if lacking:
             why = f'no varying {" or ".join(lacking)}'
         return [f'no friction found: {why}'], ''
-    explained, size, force, motion = best
+    (explained, sense), force, motion = best
     what = (
         f'{force.topic.name} {force.axis} is probably the force, {motion.topic.name} '
         f'{motion.axis} the motion: its direction and speed explain '
@@ -347,7 +348,8 @@ def _suggestion(
         if len([topic for topic in components if topic.type_name in types]) > 1:
             options += [option, one.topic.name]
     axis = force.axis
-    if size < 0.0:
+    words += [_UNSIGNED] * (not sense)
+    if sense < 0.0:
         words.append('the force is opposite to the motion: sign reversed')
         axis = f'-{axis}'
     if axis != 'y':
@@ -359,29 +361,14 @@ def _suggestion(
     return words, command
 
 
-def _friction(force: _Signal, motion: _Signal) -> tuple[float, float]:
-    """Return the fraction of a force explained by Coulomb and viscous friction, and mu_s [N]."""
+def _friction(force: _Signal, motion: _Signal) -> Likeness:
     offset, _ = reading.clock_offset(force.samples, motion.samples)
     stamps, moved = force.samples.stamps - offset, motion.samples.stamps
-    start, end = max(stamps[0], moved[0]), min(stamps[-1], moved[-1])
-    if end <= start:
-        return 0.0, 0.0
-    every = max(1, len(moved) // _TRIED)
-    time = 1e-9 * (moved[::every] - start)
-    values = motion.values[::every]
-    velocity = values if motion.topic.type_name in _VELOCITIES else np.gradient(values, time)
-    read = np.interp(time, 1e-9 * (stamps - start), force.values)
-    moving = np.abs(velocity) > _MOVING * np.quantile(np.abs(velocity), 0.99)
-    moving &= (time >= 0.0) & (time <= 1e-9 * (end - start))
-    if np.count_nonzero(moving) < 10:
-        return 0.0, 0.0
-    x = np.column_stack([np.sign(velocity), velocity, np.ones_like(velocity)])[moving]
-    y = read[moving]
-    solution = np.linalg.lstsq(x, y, rcond=None)[0]
-    variance = float(np.var(y))
-    if not variance:
-        return 0.0, 0.0
-    # With motion in one direction, friction and an offset are not distinguishable.
-    friction = x[:, :2] @ solution[:2]
-    along, left = float(np.var(friction)), float(np.var(y - x @ solution))
-    return max(0.0, min(along, variance - left) / variance), float(np.mean(friction * x[:, 0]))
+    both = (max(stamps[0], moved[0]) <= moved) & (moved <= min(stamps[-1], moved[-1]))
+    if np.count_nonzero(both) < 2:
+        return Likeness()
+    time = 1e-9 * (moved[both] - moved[0])
+    values = motion.values[both]
+    is_velocity = motion.topic.type_name in _VELOCITIES
+    velocity = values if is_velocity else velocity_of(time, values)
+    return likeness(time, velocity, np.interp(time, 1e-9 * (stamps - moved[0]), force.values))

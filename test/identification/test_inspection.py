@@ -220,6 +220,27 @@ def test_table_columns_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[
     capsys.readouterr()
 
 
+@pytest.mark.parametrize('speeds', [(0.005, 0.005), (0.01, 0.0025)])
+def test_the_sign_of_a_motion_in_one_direction_is_kept(
+    tmp_path: Path, speeds: tuple[float, float]
+) -> None:
+    """The first row has no speed: its force does not decide. Also with the sensor's zero."""
+    time = np.arange(1000) / 100.0
+    velocity = np.where(time < 5.0, *speeds)
+    force = 1.0 + 0.5 + 200.0 * velocity + 0.02 * np.random.default_rng(0).normal(size=1000)
+    force[0] = 2.0
+    rows = np.column_stack([time, np.cumsum(velocity) / 100.0, force])
+    path = tmp_path / 'run.csv'
+    for name, known in (('in', False), ('in and out', True)):
+        if known:
+            rows = np.vstack([rows, rows * (1.0, 1.0, -1.0) + (10.0, 0.0, 0.0)])
+            rows[1000:, 1] = rows[999::-1, 1]
+        np.savetxt(path, rows, delimiter=',', header='time,depth,force', comments='')
+        found = inspect_recording(path)
+        assert found.command.endswith('time=time,depth=depth,force=force'), name
+        assert ('the motion does not reverse' in found.words[-1]) != known
+
+
 def test_a_table_of_a_steered_insertion_is_recognized(tmp_path: Path) -> None:
     path = tmp_path / 'gel 1.csv'
     rows = '\n'.join(f'{1 + k},{-5 * k},{2 + k},{0.1 * k},{-5 * k},{0.2 * k}' for k in range(9))
