@@ -183,12 +183,13 @@ class Design:
                 f'steady motion above {signals.settings.moving_speed:g} m/s must last '
                 f'{needed:.3g} s in all, lasts '
                 f'{np.count_nonzero(self.used) * signals.period:.3g} s: move longer, or choose '
-                'another axis or topic'
+                'another axis, topic or column'
             )
         force = signals.force[self.used]
         if np.ptp(force) == 0.0:
             raise IdentificationError(
-                f'the force must vary, got {force[0]:g} N throughout: choose another axis or topic'
+                f'the force must vary, got {force[0]:g} N throughout: '
+                'choose another axis, topic or column'
             )
 
 

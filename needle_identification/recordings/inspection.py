@@ -14,8 +14,9 @@ from needle_dynamics.arrays import FloatArray
 from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError, WrongSignError
-from needle_identification.recordings import reading, tables
+from needle_identification.recordings import friction_table, reading, tables
 from needle_identification.recordings.likeness import Likeness, likeness, velocity_of
+from needle_identification.recordings.merging import clock_offset
 from needle_identification.recordings.recording import Recording
 from needle_identification.recordings.samples import (
     are_gaps,
@@ -129,7 +130,7 @@ def _table(path: Path) -> Inspection:
     content = Content(name=path.name, type_name='table', count=count, columns=columns)
     words = [f'{role} by name or unit: {spec}' for role, spec in roles.items()]
     words += [f'factor: {name} = {value:g}' for name, value in table.scalars.items()]
-    lacking = tables.missing_roles(roles)
+    lacking = friction_table.missing_roles(roles)
     kind, unknown, columns_of = 'friction', '', roles
     steered = steering_columns(table)
     steerable = {*STEERING_ROLES} - {*steered} <= {'roll'}
@@ -142,7 +143,7 @@ def _table(path: Path) -> Inspection:
         columns_of = {role: roles.get(role, 'NAME') for role in tables.ROLES if role != 'speed'}
     else:
         try:
-            sense = _sense(tables.friction_recording(table, roles))
+            sense = _sense(friction_table.friction_recording(table, roles))
         except RecordingError as error:
             unknown, sense = _reason(table, error), 1.0
         if sense < 0.0:
@@ -338,7 +339,7 @@ def _suggestion(
         f'{100.0 * explained:.0f} % of the force'
     )
     words = [what]
-    if loss := reading.clock_offset(force.samples, motion.samples)[1]:
+    if loss := clock_offset(force.samples, motion.samples)[1]:
         words.append(loss)
     options = []
     for option, one, types in (
@@ -362,7 +363,7 @@ def _suggestion(
 
 
 def _friction(force: _Signal, motion: _Signal) -> Likeness:
-    offset, _ = reading.clock_offset(force.samples, motion.samples)
+    offset, _ = clock_offset(force.samples, motion.samples)
     stamps, moved = force.samples.stamps - offset, motion.samples.stamps
     both = (max(stamps[0], moved[0]) <= moved) & (moved <= min(stamps[-1], moved[-1]))
     if np.count_nonzero(both) < 2:

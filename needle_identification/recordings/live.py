@@ -7,7 +7,7 @@ from typing import Final
 
 from needle_dynamics.arrays import IntArray
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.reading import friction_recording
+from needle_identification.recordings.merging import merged_recording
 from needle_identification.recordings.recording import Recording
 from needle_identification.recordings.samples import position_and_velocity, Samples, Series
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES
@@ -124,7 +124,7 @@ class LiveRecording:
             Samples(name, series.stamps, series.values, np.zeros(1, dtype=np.int64))
             for name, series in self._series.items()
         )
-        return friction_recording(self, force, position_and_velocity(motion, self))
+        return merged_recording(self, force, position_and_velocity(motion, self))
 
     def _discard(self) -> None:
         """Discard the samples before the last motions."""

@@ -272,7 +272,8 @@ def source_of(type_name: str, axes: Sequence[str], joint: str | None = None) -> 
 class SampleOrigin(Protocol):
     """Bag or running topics: its name for messages, and its discarded and repaired data."""
 
-    losses: list[str]
+    @property
+    def losses(self) -> list[str]: ...
 
     @property
     def path(self) -> object: ...

@@ -10,7 +10,7 @@ two columns, seconds and nanoseconds, is ``time=sec:nanosec``.
 
 from array import array
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE, getincrementaldecoder
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv
 from datetime import datetime
@@ -26,7 +26,6 @@ from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import form_of, MATLAB, METADATA, TABLES
 from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.recording import integrated, Recording
 from needle_identification.recordings.samples import are_gaps, Series
 from needle_identification.recordings.units import (
     BRACKETS,
@@ -124,43 +123,6 @@ def read_table(path: Path) -> Table:
     if not table.columns:
         raise RecordingError(f'{path} holds no columns of numbers')
     return table
-
-
-def friction_recording(table: Table, columns: Mapping[str, str]) -> Recording:
-    """Return force and motion of a table; roles missing in `columns` are found by usual names."""
-    path = table.path
-    specs = {**guessed(table.columns), **columns}
-    if missing := missing_roles(specs):
-        raise RecordingError(
-            f'{path}: which column is {" and ".join(missing)}? It has '
-            f'{", ".join(table.columns)}: use --columns {missing[0].split()[0]}=NAME,...'
-        )
-    losses = list(table.losses)
-    values = {role: column_values(table, role, spec, losses) for role, spec in specs.items()}
-    if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
-        losses.append(f'columns by their names: {words}')
-    roles = [role for role in ('force', 'depth', 'speed') if role in values]
-    rows = np.column_stack([values[role] for role in roles])
-    _, stamps, rows = sorted_rows(path, values['time'], rows, losses)
-    found = dict(zip(roles, rows.T, strict=True))
-    times = 1e-9 * (stamps - stamps[0])
-    if 'depth' not in found:
-        losses.append('no depth: it is the integral of the speed from 0')
-        found['depth'] = integrated(times, found['speed'])
-    return Recording(
-        name=str(path),
-        time=times,
-        depth=found['depth'],
-        velocity=found.get('speed'),
-        force=found['force'],
-        losses=tuple(losses),
-    )
-
-
-def missing_roles(specs: Collection[str]) -> list[str]:
-    """Return what friction needs in addition to the roles in ``specs``."""
-    either = [] if {'depth', 'speed'} & {*specs} else ['depth or speed']
-    return [role for role in ('time', 'force') if role not in specs] + either
 
 
 def guessed(

@@ -9,13 +9,8 @@ from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import Roles, tables
-from needle_identification.recordings.reading import (
-    chosen_topic,
-    read_samples,
-    span_of,
-    TIP,
-    Wanted,
-)
+from needle_identification.recordings.merging import span_of
+from needle_identification.recordings.reading import chosen_topic, read_samples, TIP, Wanted
 from needle_identification.recordings.recording import SensorRecording
 from needle_identification.recordings.samples import EachJoint, SignalSource, source_of
 from needle_ros import wire

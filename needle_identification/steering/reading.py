@@ -24,7 +24,7 @@ from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.bags.bag import Bag
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import reading, tables
-from needle_identification.recordings.reading import merge
+from needle_identification.recordings.merging import merge
 from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import Table
 from needle_identification.recordings.units import unit_of, UNITS

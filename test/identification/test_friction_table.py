@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables whose rows are not samples of force and motion at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from needle_identification import FrictionEstimate, identify_friction, read_friction_recording
+from needle_identification.recordings.friction_table import held_rows
+import numpy as np
+import pytest
+from support.strokes import COULOMB, strokes, VISCOUS
+
+
+def written(path: Path, names: str, *columns: Any) -> Path:
+    rows = np.column_stack(columns)
+    np.savetxt(path, rows, delimiter=',', fmt='%.9g', header=names, comments='')
+    return path
+
+
+def assert_true(found: FrictionEstimate, errors: float = 4.0) -> None:
+    for name, truth in (('coulomb_friction', COULOMB), ('viscous_friction', VISCOUS)):
+        assert abs(found[name].value - truth) < errors * found[name].error
+
+
+@pytest.mark.parametrize('every', [2, 5, 10])
+@pytest.mark.parametrize('has_speed', [False, True])
+def test_repeated_positions_are_samples_of_their_own(
+    tmp_path: Path, every: int, has_speed: bool
+) -> None:
+    """As those of a topic of the robot, at 125, 50 and 25 Hz."""
+    made = strokes(seed=1, push=0.0)
+    held = np.arange(len(made.time)) // every * every
+    columns = [made.time, 1e3 * made.depth[held], made.force]
+    columns += [made.velocity[held]] * has_speed
+    names = 'time,q_mm,force' + ',speed' * has_speed
+    read = read_friction_recording(written(tmp_path / 'run.csv', names, *columns))
+    (line,) = [one for one in read.losses if 'repeated' in one]
+    assert line.startswith(f'the motion is measured in every {every} rows')
+    assert (read.velocity is not None) == has_speed
+    assert_true(identify_friction(read))
+
+
+def test_rests_and_counts_are_no_repetitions() -> None:
+    """Counts of 1 um to 0.1 mm, at 250 Hz and speeds from less to more than a count a row."""
+    made = strokes(seed=1, push=0.0)
+    for size in (0.0, 1e-6, 1e-5, 1e-4):
+        depth = np.round(made.depth / size) * size if size else made.depth
+        for slower in (1.0, 0.1, 0.01):
+            assert held_rows(slower * depth, made.force)[1] == 0
+            counts = np.round(slower * made.depth / (size or 1e-7))
+            assert held_rows(counts, made.force)[1] == 0
+
+
+def test_a_force_that_is_repeated_with_the_position_is_no_topic_of_its_own() -> None:
+    made = strokes(seed=1, push=0.0)
+    held = np.arange(len(made.time)) // 5 * 5
+    assert held_rows(made.depth[held], made.force)[1] == 5
+    assert held_rows(made.depth[held], made.force[held])[1] == 0
+
+
+@pytest.mark.parametrize('has_force', [False, True])
+def test_force_and_position_in_different_rows(tmp_path: Path, has_force: bool) -> None:
+    """A row in four has a position, alone or with a force."""
+    made = strokes(seed=1, push=0.0)
+    moved = np.arange(len(made.time)) % 4 == 0
+    depth = np.where(moved, made.depth, np.nan)
+    force = np.where(moved & (not has_force), np.nan, made.force)
+    path = written(tmp_path / 'run.csv', 'time,depth,force', made.time, depth, force)
+    read = read_friction_recording(path)
+    count = np.count_nonzero(np.isfinite(force))
+    # The last rows are after the last position.
+    assert count - 4 < len(read.time) <= count
+    assert f'force in {count} rows, motion in {np.count_nonzero(moved)}' in ' '.join(read.losses)
+    assert_true(identify_friction(read))
