@@ -8,17 +8,34 @@ positions are samples of their own, interpolated to the times of the force as th
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.errors import RecordingError
+from needle_identification.recordings.likeness import (
+    EXPLAINED,
+    likeness,
+    most_alike,
+    oblique,
+    velocity_of,
+)
 from needle_identification.recordings.merging import merged_recording
 from needle_identification.recordings.recording import integrated, Recording
 from needle_identification.recordings.samples import Samples
-from needle_identification.recordings.tables import column_values, guessed, sorted_rows, Table
+from needle_identification.recordings.tables import (
+    column_of,
+    column_values,
+    guessed,
+    measured_values,
+    plain_name,
+    sorted_rows,
+    Table,
+)
+from needle_ros.quantities import AXES
 import numpy as np
 
+_CHOSEN: Final = ('depth', 'force')  # roles that may have several components
 _COUNTS: Final = 3.0  # least change in fast motion, as a multiple of the smallest one: one count
 _FEWEST: Final = 20  # least number of such changes
 _USUAL: Final = 0.9  # least part of them with the usual distance
@@ -29,17 +46,75 @@ _NEXT: Final = 0.75  # least distance of a repetition to the next change [usual 
 
 def friction_recording(table: Table, columns: Mapping[str, str]) -> Recording:
     """Return force and motion of a table; roles missing in `columns` are found by usual names."""
-    path = table.path
     specs = {**guessed(table.columns), **columns}
     if missing := missing_roles(specs):
         raise RecordingError(
-            f'{path}: which column is {" and ".join(missing)}? It has '
+            f'{table.path}: which column is {" and ".join(missing)}? It has '
             f'{", ".join(table.columns)}: use --columns {missing[0].split()[0]}=NAME,...'
         )
+    return _read(table, friction_columns(table, specs, columns), columns)
+
+
+def friction_columns(
+    table: Table, specs: Mapping[str, str], given: Collection[str] = ()
+) -> dict[str, str]:
+    """Return columns with those components of position and force that are most like friction."""
+    roles = [role for role in _CHOSEN if role in specs and role not in given]
+    vectors = [_vector(table, specs[role]) or [specs[role]] for role in roles]
+    tried = [{**specs, **dict(zip(roles, names, strict=True))} for names in product(*vectors)]
+    if len(tried) == 1:
+        return dict(specs)
+    found = []
+    for one in tried:
+        read = _read(table, one, one)
+        like = likeness(read.time, velocity_of(read.time, read.depth), read.force)
+        found.append((like, float(np.ptp(read.depth) * np.ptp(read.force)), ''))
+    best = most_alike(found)
+    if found[best][0].explained < EXPLAINED:
+        several = [
+            f'{role} is {", ".join(names)}'
+            for role, names in zip(roles, vectors, strict=True)
+            if len(names) > 1
+        ]
+        raise RecordingError(
+            f'{table.path}: which {" and which ".join(several)}? No force depends on the '
+            f'direction of a motion: use --columns {",".join(f"{role}=NAME" for role in roles)}'
+        )
+    return tried[best]
+
+
+def _vector(table: Table, spec: str) -> list[str]:
+    """Return the varying columns x, y and z of the vector with a column; none without a vector."""
+    short = plain_name(column_of(table, spec))
+    names = [
+        name
+        for name, values in table.columns.items()
+        if (plain := plain_name(name))[:-1] == short[:-1]
+        and plain[-1:] in AXES
+        and np.ptp(measured_values(values)) > 0.0
+    ]
+    return names if short[-1:] in AXES else []
+
+
+def _oblique(table: Table, spec: str) -> list[str]:
+    name, names = column_of(table, spec), _vector(table, spec)
+    if name not in names:
+        return []
+    columns = np.column_stack([table.columns[one] for one in names])
+    columns = columns[np.isfinite(columns).all(axis=1)]
+    others = dict(zip(names, columns.T, strict=True))
+    return oblique(name, others.pop(name), others) if len(columns) else []
+
+
+def _read(table: Table, specs: Mapping[str, str], columns: Collection[str]) -> Recording:
+    path = table.path
     losses = list(table.losses)
     values = {role: column_values(table, role, spec, losses) for role, spec in specs.items()}
     if words := ', '.join(f'{role}={spec}' for role, spec in specs.items() if role not in columns):
-        losses.append(f'columns by their names: {words}')
+        found = [specs[role] for role in _CHOSEN if role in specs and role not in columns]
+        chosen = any(len(_vector(table, spec)) > 1 for spec in found)
+        losses.append(f'columns by their names{" and values" if chosen else ""}: {words}')
+    losses += _oblique(table, specs['depth']) if 'depth' in specs else []
     moving = [role for role in ('depth', 'speed') if role in values]
     time, force = values['time'], values['force'][:, np.newaxis]
     motion = np.column_stack([values[role] for role in moving])

@@ -15,9 +15,15 @@ from needle_identification.bags.bag import Bag
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError, WrongSignError
 from needle_identification.recordings import friction_table, reading, tables
-from needle_identification.recordings.likeness import Likeness, likeness, velocity_of
+from needle_identification.recordings.likeness import (
+    EXPLAINED,
+    Likeness,
+    likeness,
+    most_alike,
+    oblique,
+    velocity_of,
+)
 from needle_identification.recordings.merging import clock_offset
-from needle_identification.recordings.recording import Recording
 from needle_identification.recordings.samples import (
     are_gaps,
     EachJoint,
@@ -25,11 +31,11 @@ from needle_identification.recordings.samples import (
     Samples,
     source_of,
 )
+from needle_identification.recordings.tables import column_values, measured_values
 from needle_identification.steering.reading import (
     check_depth,
     is_inverted,
     JOINTS,
-    measured_values,
     read_steering_recording,
     steering_columns,
     STEERING_ROLES,
@@ -44,7 +50,6 @@ import numpy as np
 
 _FORCE: Final = (wire.WRENCH,)  # message types of forces
 _VELOCITIES: Final = (wire.TWIST,)  # message types of velocities
-_EXPLAINED: Final = 0.3  # smallest part of a force that is like friction
 _UNSIGNED: Final = 'the motion does not reverse: the sign of the force cannot be found'
 
 #: Least motion of a steered insertion, by role [m, rad].
@@ -112,7 +117,7 @@ def inspect_recording(path: Path | str) -> Inspection:
 def _guide_moves(table: tables.Table, steered: Mapping[str, str]) -> bool:
     with suppress(RecordingError):
         return any(
-            np.ptp(measured_values(tables.column_values(table, role, steered[role], []))) > least
+            np.ptp(measured_values(column_values(table, role, steered[role], []))) > least
             for role, least in _STEERED.items()
             if role in steered
         )
@@ -121,10 +126,7 @@ def _guide_moves(table: tables.Table, steered: Mapping[str, str]) -> bool:
 
 def _table(path: Path) -> Inspection:
     table = tables.read_table(path)
-    roles = {
-        role: tables.with_unit(role, spec, table.columns.get(spec, np.empty(0)))
-        for role, spec in tables.guessed(table.columns).items()
-    }
+    roles = _with_units(table, tables.guessed(table.columns))
     columns = tuple(_column(name, values) for name, values in table.columns.items())
     count = len(next(iter(table.columns.values())))
     content = Content(name=path.name, type_name='table', count=count, columns=columns)
@@ -143,16 +145,10 @@ def _table(path: Path) -> Inspection:
         columns_of = {role: roles.get(role, 'NAME') for role in tables.ROLES if role != 'speed'}
     else:
         try:
-            sense = _sense(friction_table.friction_recording(table, roles))
+            columns_of, said = _friction_roles(table, roles)
+            words = said + words[len(roles) :]
         except RecordingError as error:
-            unknown, sense = _reason(table, error), 1.0
-        if sense < 0.0:
-            columns_of = {
-                role: f'-{spec}' if role in ('depth', 'speed') else spec
-                for role, spec in roles.items()
-            }
-            words.append('motion reversed: the force of friction has the sign of the velocity')
-        words += [_UNSIGNED] * (not sense)
+            unknown = _reason(table, error)
     words += [unknown] * bool(unknown)
     named = ','.join(f'{role}={spec}' for role, spec in columns_of.items())
     return Inspection(
@@ -162,12 +158,37 @@ def _table(path: Path) -> Inspection:
     )  # fmt: skip
 
 
+def _friction_roles(
+    table: tables.Table, guess: Mapping[str, str]
+) -> tuple[dict[str, str], list[str]]:
+    """Return the columns with the sign of the motion, and words on them."""
+    roles = _with_units(table, friction_table.friction_columns(table, guess))
+    words = [f'{role} by name or unit: {spec}' for role, spec in roles.items()]
+    read = friction_table.friction_recording(table, roles)
+    sense = likeness(read.time, velocity_of(read.time, read.depth), read.force).sense
+    if sense < 0.0:
+        words.append('motion reversed: the force of friction has the sign of the velocity')
+        roles = {
+            role: f'-{spec}' if role in ('depth', 'speed') else spec
+            for role, spec in roles.items()
+        }
+    words += [_UNSIGNED] * (not sense)
+    return roles, words
+
+
+def _with_units(table: tables.Table, specs: Mapping[str, str]) -> dict[str, str]:
+    return {
+        role: tables.with_unit(role, spec, table.columns.get(spec, np.empty(0)))
+        for role, spec in specs.items()
+    }
+
+
 def _refusal(table: tables.Table, columns: Mapping[str, str]) -> str:
     """Return why columns of a steered insertion are not usable, such as by their unit, or ''."""
     try:
         check_depth(table, columns['depth'])
         for role, spec in columns.items():
-            tables.column_values(table, role, spec, [])
+            column_values(table, role, spec, [])
     except RecordingError as error:
         return _reason(table, error)
     return ''
@@ -175,10 +196,6 @@ def _refusal(table: tables.Table, columns: Mapping[str, str]) -> str:
 
 def _reason(table: tables.Table, error: RecordingError) -> str:
     return str(error).removeprefix(f'{table.path}').lstrip(': ')
-
-
-def _sense(read: Recording) -> float:
-    return likeness(read.time, velocity_of(read.time, read.depth), read.force).sense
 
 
 def _column(name: str, values: FloatArray) -> ColumnSummary:
@@ -200,6 +217,12 @@ class _Signal(NamedTuple):
     @property
     def values(self) -> FloatArray:
         return self.samples.values
+
+    @property
+    def vector(self) -> str:
+        """Name of the vector that has the component: joints are no vector."""
+        is_joint = self.topic.type_name == wire.JOINT_STATE
+        return f'{self.topic.name} {self.axis if is_joint else ""}'
 
     @property
     def varies(self) -> bool:
@@ -324,15 +347,23 @@ def _suggestion(
     """
     forces = [one for one in signals if one.topic.type_name in _FORCE]
     motions = [one for one in signals if one.topic.type_name in reading.MOTIONS]
-    pairs = [(_friction(force, motion), force, motion) for force in forces for motion in motions]
-    best = max(pairs, key=lambda pair: pair[0].explained, default=None)
-    if best is None or best[0].explained < _EXPLAINED:
-        lacking = [what for what, found in (('force', forces), ('motion', motions)) if not found]
+    pairs = [(force, motion) for force in forces for motion in motions]
+    found = [
+        (
+            _friction(force, motion),
+            float(np.ptp(force.values) * np.ptp(motion.values)),
+            (force.vector, motion.vector),
+        )
+        for force, motion in pairs
+    ]
+    best = most_alike(found) if found else 0
+    if not found or found[best][0].explained < EXPLAINED:
+        lacking = [what for what, known in (('force', forces), ('motion', motions)) if not known]
         why = 'no force depends on the direction of a motion'
         if lacking:
             why = f'no varying {" or ".join(lacking)}'
         return [f'no friction found: {why}'], ''
-    (explained, sense), force, motion = best
+    (explained, sense), (force, motion) = found[best][0], pairs[best]
     what = (
         f'{force.topic.name} {force.axis} is probably the force, {motion.topic.name} '
         f'{motion.axis} the motion: its direction and speed explain '
@@ -341,6 +372,12 @@ def _suggestion(
     words = [what]
     if loss := clock_offset(force.samples, motion.samples)[1]:
         words.append(loss)
+    across = {
+        one.axis: one.values
+        for one in motions
+        if one.vector == motion.vector and one.axis != motion.axis
+    }
+    words += oblique(motion.axis, motion.values, across)
     options = []
     for option, one, types in (
         ('--wrench-topic', force, _FORCE),

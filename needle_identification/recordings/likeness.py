@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Similarity of a force and a motion to friction, and their signs."""
 
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 import numpy as np
 
+EXPLAINED: Final = 0.3  #: smallest part of a force that is like friction
+
+_ALIKE: Final = 0.02  # difference of this part below which the larger components are chosen
+_IN_PROPORTION: Final = 0.95  # smallest squared correlation of components of an oblique motion
+_OBLIQUE: Final = 0.1  # smallest motion of another component: the speed is 0.5 % too small
 _MOVING: Final = 0.05  # smallest speed in motion, as a fraction of the largest speed
 _TRIED: Final = 20_000  # largest number of samples on which a pair of force and motion is fitted
 _SPAN: Final = 0.01  # time before and after a sample for its speed, against noise and counts [s]
@@ -55,3 +61,35 @@ def _sense(signs: FloatArray, force: FloatArray) -> float:
         if common[1] > _LEAST:
             return float(np.sign(signs[used] @ (force[used] - force[used].mean())))
     return 0.0
+
+
+def most_alike(found: Sequence[tuple[Likeness, float, object]]) -> int:
+    """
+    Return the index of the pair that is most similar to friction, at least one pair.
+
+    A pair has its likeness, its size, and its vectors of force and motion. All components of a
+    vector may be alike if it is oblique to the axes: then the largest one is chosen.
+    """
+    best = max(range(len(found)), key=lambda k: found[k][0].explained)
+    (explained, _), _, vectors = found[best]
+    alike = [
+        k
+        for k, (one, _, same) in enumerate(found)
+        if same == vectors and one.explained > explained - _ALIKE
+    ]
+    return max(alike, key=lambda k: found[k][1])
+
+
+def oblique(name: str, moved: FloatArray, others: Mapping[str, FloatArray]) -> list[str]:
+    """Warn of other components by name that move in proportion to a component, (n,) each."""
+    about, lines = moved - moved.mean(), []
+    power = about @ about
+    for other, values in others.items():
+        along = values - values.mean()
+        ratio = (about @ along) / power if power else 0.0
+        if abs(ratio) > _OBLIQUE and ratio**2 * power > _IN_PROPORTION * (along @ along):
+            lines.append(
+                f'{other} moves by {ratio:.2g} of {name}: the motion is oblique to the axis, '
+                'rotate it or choose the axis along the needle'
+            )
+    return lines

@@ -12,6 +12,7 @@ from needle_identification.bags.bag import Bag, TABLES
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import friction_table, samples, tables, TIMES
+from needle_identification.recordings.likeness import oblique
 from needle_identification.recordings.merging import merge, merged_recording
 from needle_identification.recordings.recording import IndentationRecording, Recording
 from needle_ros import wire
@@ -120,6 +121,11 @@ def read_friction_recording(
     gathered, configuration = read_samples(bag, {wrench: force_source, motion: source}, time)
     force = gathered[wrench].samples(bag)
     moved = gathered[motion].samples(bag)
+    if isinstance(source, samples.ObliqueVector):
+        along, *across = moved.values.T
+        lines = oblique(source.axes[0], along, dict(zip(source.axes[1:], across, strict=True)))
+        bag.losses += [f'{motion.name}: {line}' for line in lines]
+        moved = moved._replace(values=moved.values[:, :1])
     if motion.type_name in (wire.TWIST, wire.JOINT_STATE, wire.ODOMETRY):
         moved = samples.position_and_velocity(moved, bag)
     else:
@@ -192,7 +198,9 @@ def _motion_source(
         sign, joint = signed(axis or '')
         return samples.source_of(topic.type_name, 'y', joint or _only_joint(bag, topic)), sign
     sign, name = signed_axis('y' if axis is None else axis, 'motion axis')
-    return samples.source_of(topic.type_name, [name]), sign
+    if topic.type_name == wire.ODOMETRY:
+        return samples.source_of(topic.type_name, [name]), sign
+    return samples.ObliqueVector(name), sign
 
 
 def _only_joint(bag: Bag, topic: BagTopic) -> str | None:

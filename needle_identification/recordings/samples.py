@@ -147,6 +147,18 @@ class _Vector(SignalSource):
         return [begin + offset for offset in self._offsets]
 
 
+class ObliqueVector(_Vector):
+    """An axis, and the two others, which may be not finite: then they are 0.0."""
+
+    def __init__(self, axis: str) -> None:
+        self.axes = [axis, *(other for other in AXES if other != axis)]
+        super().__init__(*self.axes)
+
+    def values(self, numbers: FloatArray) -> FloatArray:
+        numbers[:, 1:] = np.where(np.abs(numbers[:, 1:]) < _LARGEST, numbers[:, 1:], 0.0)
+        return numbers
+
+
 class _Odometry(SignalSource):
     """Position, velocity and its validity; the pose is in the frame, the twist in the body."""
 

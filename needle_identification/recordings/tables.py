@@ -166,6 +166,19 @@ def plain_name(name: str) -> str:
     return _WORD.sub('', name.lower())
 
 
+def measured_values(column: FloatArray) -> FloatArray:
+    """Return the values of a column without those that are missing, at least one."""
+    found = column[np.isfinite(column)]
+    return found if len(found) else np.zeros(1)
+
+
+def column_of(table: Table, spec: str) -> str:
+    """Return the name of a column without sign, factor, unit and shift."""
+    if spec in table.columns:
+        return spec
+    return re.split(r'\s*[*\[@]', spec.lstrip('-'), maxsplit=1)[0].strip()
+
+
 def with_unit(role: str, name: str, values: FloatArray) -> str:
     """Return a column with the probable unit if its name states none and its values are large."""
     finite = values[np.isfinite(values)]

@@ -195,12 +195,12 @@ def _shifted(table: Table, role: str, spec: str, losses: list[str]) -> FloatArra
 def steering_columns(table: Table, given: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the columns by role that are given or found, with sign and unit: ``--columns``."""
     given, found = given or {}, tables.guessed(table.columns, USUAL)
-    names = {**found, **{role: _column_of(table, spec) for role, spec in given.items()}}
+    names = {**found, **{role: tables.column_of(table, spec) for role, spec in given.items()}}
     specs = {role: names[role] for role in STEERING_ROLES if names.get(role) in table.columns}
     if 'depth' not in specs:
         return {**specs, **given}
     units = _units(table, specs, given)
-    depth = measured_values(table.columns[specs['depth']])
+    depth = tables.measured_values(table.columns[specs['depth']])
     for role, unit in units.items():
         if unit_of(specs[role], role) is None and unit:
             specs[role] = f'{specs[role]}[{unit}]'
@@ -220,7 +220,7 @@ def check_depth(table: Table, spec: str) -> None:
     name = spec.lstrip('-')
     if name not in table.columns or unit_of(name, 'depth') is not None:
         return
-    if (span := float(np.ptp(measured_values(table.columns[name])))) > _LARGE:
+    if (span := float(np.ptp(tables.measured_values(table.columns[name])))) > _LARGE:
         raise RecordingError(
             f'{table.path}: {name} spans {span:.3g} without a unit, mm or cm: '
             f"use --columns 'depth={spec}[mm]' or 'depth={spec}[cm]'"
@@ -230,7 +230,7 @@ def check_depth(table: Table, spec: str) -> None:
 def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
     """Return the unit of each role, '' if unknown or in SI units."""
     stated = {role: unit_of(given.get(role, name), role) for role, name in specs.items()}
-    moved = {role: measured_values(table.columns[name]) for role, name in specs.items()}
+    moved = {role: tables.measured_values(table.columns[name]) for role, name in specs.items()}
     bodies = {
         role: re.sub(r'^[xyz]|[xyz123]$', '', tables.plain_name(name))
         for role, name in specs.items()
@@ -264,7 +264,7 @@ def _along(table: Table, depth: float) -> set[str]:
     names = tables.guessed(table.columns, _TIP_ALONG)
     if 'along' not in names or not depth:
         return set()
-    span = float(np.ptp(measured_values(table.columns[names['along']])))
+    span = float(np.ptp(tables.measured_values(table.columns[names['along']])))
     for unit in ('m', 'cm', 'mm'):
         if _ALONG < span * UNITS['depth'][unit] / depth < 1.0 / _ALONG:
             return {'' if unit == 'm' else unit}
@@ -274,7 +274,7 @@ def _along(table: Table, depth: float) -> set[str]:
 def new_rows(table: Table, specs: Mapping[str, str]) -> tuple[BoolArray, list[str]]:
     """Return in which rows guide and depth are measured, and the columns of their times."""
     rows = len(next(iter(table.columns.values())))
-    moved = [_column_of(table, specs[role]) for role in _MOVED_ROLES if role in specs]
+    moved = [tables.column_of(table, specs[role]) for role in _MOVED_ROLES if role in specs]
     # Measured bodies, such as ``Base`` for ``Base x``.
     bodies = {part for name in moved if (part := _COMPONENT.sub('', name)) not in ('', name)}
     words = [re.escape(word) for word in bodies]
@@ -286,16 +286,3 @@ def new_rows(table: Table, specs: Mapping[str, str]) -> tuple[BoolArray, list[st
     new = (read != 0.0).any(axis=1) & np.isfinite(read).all(axis=1)
     new[1:] &= (read[1:] != read[:-1]).any(axis=1)
     return new, times
-
-
-def measured_values(column: FloatArray) -> FloatArray:
-    """Return the values of a column without those that are missing, at least one."""
-    found = column[np.isfinite(column)]
-    return found if len(found) else np.zeros(1)
-
-
-def _column_of(table: Table, spec: str) -> str:
-    """Return the name of a column without sign, factor, unit and shift."""
-    if spec in table.columns:
-        return spec
-    return re.split(r'\s*[*\[@]', spec.lstrip('-'), maxsplit=1)[0].strip()

@@ -6,7 +6,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from needle_identification import FrictionEstimate, identify_friction, read_friction_recording
+from needle_identification import (
+    FrictionEstimate,
+    identify_friction,
+    inspect_recording,
+    read_friction_recording,
+    RecordingError,
+)
 from needle_identification.recordings.friction_table import held_rows
 import numpy as np
 import pytest
@@ -74,3 +80,39 @@ def test_force_and_position_in_different_rows(tmp_path: Path, has_force: bool) -
     assert count - 4 < len(read.time) <= count
     assert f'force in {count} rows, motion in {np.count_nonzero(moved)}' in ' '.join(read.losses)
     assert_true(identify_friction(read))
+
+
+def test_the_needle_axis_is_chosen_among_components(tmp_path: Path) -> None:
+    """Of a robot and a sensor with 2 % of the motion and of the force along the other axes."""
+    made, rng = strokes(seed=1, push=0.0), np.random.default_rng(2)
+    few = 0.02 + 1e-5 * rng.normal(size=(4, len(made.time)))
+    across = few * [made.depth, made.depth, made.force, made.force]
+    names = 'time,x [mm],y [mm],z [mm],fx,fy,fz'
+    columns = [*(1e3 * across[:2]), 1e3 * made.depth, *across[2:], made.force]
+    path = written(tmp_path / 'run.csv', names, made.time, *columns)
+    read = read_friction_recording(path)
+    assert read.losses == ('columns by their names and values: time=time, depth=z [mm], force=fz',)
+    assert_true(identify_friction(read))
+    assert 'depth=z [mm],force=fz' in inspect_recording(path).command
+    given = read_friction_recording(path, columns={'force': 'fy'})
+    assert 'depth=z [mm]' in given.losses[0]
+    assert given.force == pytest.approx(columns[4], abs=1e-8)
+    columns[5] = rng.normal(size=len(made.time))
+    columns[3:5] = columns[5], columns[5]
+    path = written(path, names, made.time, *columns)
+    said = r'which depth is x \[mm\], y \[mm\], z \[mm\] and which force is fx, fy, fz'
+    with pytest.raises(RecordingError, match=said):
+        read_friction_recording(path)
+    assert 'which depth is' in inspect_recording(path).lacking
+
+
+@pytest.mark.parametrize('angle', [0.05, 0.6])
+def test_an_oblique_motion_is_named(tmp_path: Path, angle: float) -> None:
+    """Above 0.1 rad, where its speed along the axis is 0.5 % too small."""
+    made = strokes(seed=1, push=0.0)
+    x, z = np.sin(angle) * made.depth, np.cos(angle) * made.depth
+    path = written(tmp_path / 'run.csv', 'time,x,z,force', made.time, x, z, made.force)
+    (one,) = read_friction_recording(path).losses[1:] or ['']
+    assert ('x moves by 0.68 of z: the motion is oblique' in one) == (angle > 0.1)
+    own = {'depth': 'x*2[mm]'}
+    assert 'z moves by' in ' '.join(read_friction_recording(path, columns=own).losses)

@@ -150,6 +150,30 @@ def test_the_suggested_command_succeeds_with_others_at_rest(
     assert '0.56' in capsys.readouterr().out
 
 
+def test_an_oblique_motion_of_a_bag_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The needle along x and -z; the third component is not known."""
+    made, kinds, path = strokes(seed=1, push=0.0), STORE.types, tmp_path / 'bag'
+    still = kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+    with BagWriter(path) as bag:
+        for topic, kind in (('/ft', WRENCH), ('/pose', POSE)):
+            bag.add_topic(topic, kind)
+        for t, depth, force in zip(made.time.tolist(), made.depth, made.force, strict=True):
+            stamp = EPOCH + round(1e9 * t)
+            bag.write('/ft', wrench(stamp, force), stamp)
+            point = kinds['geometry_msgs/msg/Point'](0.6 * depth, 0.0, -0.8 * depth)
+            pose = kinds['geometry_msgs/msg/Pose'](point, still)
+            message = kinds[POSE](header(stamp), pose)
+            bag.write('/pose', bytes(STORE.serialize_cdr(message, POSE)), stamp)
+    found = inspect_recording(path)
+    assert found.command.endswith('--force-axis -y --motion-axis z')
+    said = 'x moves by -0.75 of z: the motion is oblique to the axis'
+    assert any(said in one for one in found.words)
+    assert run(found.command) == 0
+    assert said in capsys.readouterr().err
+
+
 def run(command: str) -> int:
     program, *words = shlex.split(command)
     assert program == 'needle'
