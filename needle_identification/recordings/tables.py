@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv
 from datetime import datetime
-from itertools import islice
+from itertools import islice, pairwise
 import os
 from pathlib import Path
 import re
@@ -57,6 +57,9 @@ _DAMAGED: Final = (*DAMAGED, zlib.error, EOFError, IndexError, AttributeError)
 _MATLAB_HEAD: Final = 128  # length of the header of a MATLAB file [bytes]
 _COMPRESSED: Final = 15  # type code of its compressed variables
 _HEAD: Final = 200  # number of lines searched for the first line of numbers
+_RUN: Final = 100  # least mean number of rows of each of several runs in one table
+_NEAR: Final = 0.1  # latest time at which a second run starts, as a part of all times
+_OVERLAP: Final = 10  # least number of rows of a second run at times of the one before
 _LONGEST_LINE: Final = 2**16  # longest plausible line of a sample [characters]
 #: Probable unit, and the range, or for time the median step, above which it is rarely in SI units.
 _SUSPICIOUS: Final = {
@@ -263,6 +266,11 @@ def sorted_rows(
     time, rows = time[usable], rows[usable]
     if len(time) < 2:
         raise RecordingError('; '.join([f'{path} has {len(time)} usable rows', *losses]))
+    if row := _restart(time):
+        row = int(np.flatnonzero(usable)[row]) + 1
+        raise RecordingError(
+            f'{path}: time restarts at row {row} of {len(usable)}: split the file'
+        )
     start = float(time.min())
     since = time - start
     if not since.max() < 1e9:
@@ -282,6 +290,23 @@ def sorted_rows(
     if (gaps := steps[are_gaps(steps)]).size:
         losses.append(f'pauses in {len(gaps)} places, {1e-9 * gaps.sum():.3g} s in all')
     return start, series.stamps, series.values
+
+
+def _restart(time: FloatArray) -> int:
+    """Return the first row of a second run in a table, whose time begins again; else 0."""
+    steps = np.diff(time)
+    back = np.flatnonzero(are_gaps(np.abs(steps)) & (steps < 0.0)) + 1
+    # Rows in any order are sorted.
+    if len(back) > len(time) // _RUN:
+        return 0
+    latest = time.min() + _NEAR * np.ptp(time)
+    for begin, end in pairwise([*back, len(time)]):
+        before, run = time[:begin], time[begin:end]
+        # Neither a part that was stored in another place, nor single wrong times.
+        overlap = np.count_nonzero((before.min() <= run) & (run <= before.max()))
+        if run[0] <= latest and overlap >= _OVERLAP:
+            return int(begin)
+    return 0
 
 
 # Text.

@@ -244,6 +244,31 @@ def test_probable_millimeters_without_unit_are_reported(tmp_path: Path) -> None:
     assert any('depth[mm]' in words for words in read_friction_recording(path).losses)
 
 
+@pytest.mark.parametrize('begin', [0.0, 0.0013, 0.15])
+@pytest.mark.parametrize('line', ['', 'time,depth,force'])
+def test_a_time_that_restarts_is_named(tmp_path: Path, run: Any, begin: float, line: str) -> None:
+    """The rows of two runs are not interleaved, also if a second head is between them."""
+    first, second = lines('time,depth,force', *run), lines(line, run[0] + begin, *run[1:])
+    path = written(tmp_path, first + second)
+    row = len(run[0]) + 1 + bool(line)
+    with pytest.raises(RecordingError, match=f'time restarts at row {row} of .*: split the file'):
+        read_friction_recording(path)
+    assert 'time restarts' in inspect_recording(path).lacking
+
+
+def test_other_orders_of_rows_are_no_restart(tmp_path: Path, run: Any) -> None:
+    """Halves in exchanged order, random order, the newest first, and single times of zero."""
+    rows = np.column_stack(run)
+    half, random = len(rows) // 2, np.random.default_rng(1).permutation(len(rows))
+    for other in (np.vstack([rows[half:], rows[:half]]), rows[random], rows[::-1]):
+        read = read_friction_recording(written(tmp_path, lines('time,depth,force', *other.T)))
+        # Nine digits are written.
+        assert_allclose(read.force, run[2], rtol=1e-8)
+    rows[[100, 500], 0] = 0.0
+    read = read_friction_recording(written(tmp_path, lines('time,depth,force', *rows.T)))
+    assert len(read.time) == len(rows) - 1
+
+
 @pytest.mark.parametrize(
     ('text', 'columns', 'said'),
     [
