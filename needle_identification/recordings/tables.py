@@ -68,6 +68,7 @@ _SUSPICIOUS: Final = {
     'speed': (('mm/s', 2.0),),
 }
 _SECONDS: Final = ('sec', 'seconds')  #: Names of times that are in s.
+_BLANKS: Final = re.compile(r'(?i)(([-+]?\d+(,\d+)?(e[-+]?\d+)?|nan)( +|$)){2,}')  # decimal commas
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
 _SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
 
@@ -377,6 +378,8 @@ def _encoding(path: Path) -> str:
 
 def _separator(line: str) -> str | None:
     unquoted = re.sub('"[^"]*"', '', line)
+    if _BLANKS.fullmatch(unquoted.strip()):
+        return None
     return next((mark for mark in (';', '\t', ',') if mark in unquoted), None)
 
 

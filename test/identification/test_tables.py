@@ -131,6 +131,9 @@ FORMS: dict[str, tuple[Callable[..., str], dict[str, str]]] = {
     'decimal commas': (
         lambda t, q, f: lines('t;q;F', t, q, f, separator=';').replace('.', ','), NAMED,
     ),
+    'blanks and decimal commas': (
+        lambda t, q, f: lines('t q F', t, q, f, separator='  ').replace('.', ','), NAMED,
+    ),
     'quoted decimal commas': (
         lambda t, q, f: re.sub('[^,\n]+', r'"\g<0>"', lines('t,q,F', t, q, f)).replace('.', ','),
         NAMED,
