@@ -3,6 +3,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from math import ceil
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -88,6 +89,12 @@ class SteeringRecording(Displayed):
             'tip_x [m]': tip_x,
             'tip_z [m]': tip_z,
         }
+
+    @property
+    def digest(self) -> bytes:
+        """SHA-256 of motion and tip, to detect copies of a recording."""
+        parts = (self.depth, self.guide, self.roll, self.tip)
+        return sha256(b''.join(part.tobytes() for part in parts)).digest()
 
     @property
     def known(self) -> BoolArray:

@@ -131,14 +131,21 @@ def _run(options: argparse.Namespace) -> int:
     )
     reading = {name: getattr(options, name) for name in ('tip_topic', 'motion_topic', 'time')}
     reading['columns'] = column_roles(options.columns, STEERING_ROLES) if options.columns else {}
-    recordings = list[SteeringRecording]()
+    known = dict[bytes, SteeringRecording]()
+    failed = False
     with ProgressLine('reading', brief=True):
         for path in options.recordings:
             try:
                 medium = _medium_of(path, options.medium)
-                recordings.append(read_steering_recording(path, medium=medium, **reading))
-            except (NeedleError, OSError) as error:  # noqa: PERF203
+                one = read_steering_recording(path, medium=medium, **reading)
+            except (NeedleError, OSError) as error:
                 common.print_each('error', [error])
+                failed = True
+                continue
+            if (same := known.setdefault(one.digest, one)) is not one:
+                copy = f'{one.name}: the same samples as {same.name}: counts once'
+                common.print_each('warning', [copy])
+    recordings = [*known.values()]
     if not recordings:
         return 2
     common.print_each('warning', _alike(recordings))
@@ -152,7 +159,7 @@ def _run(options: argparse.Namespace) -> int:
     document = steering_document(found, recordings)
     common.print_result(document, steering_text(found), written, as_json=options.json)
     common.print_each('error', errors)
-    return 2 if errors or len(recordings) < len(options.recordings) else 0
+    return 2 if errors or failed else 0
 
 
 def _alike(recordings: Sequence[SteeringRecording]) -> list[str]:

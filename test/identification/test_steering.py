@@ -319,6 +319,17 @@ def test_a_table_of_another_laboratory_is_read_with_options(
     assert tmp_path.name in text
 
 
+def test_a_copy_of_a_table_counts_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [str(tmp_path / name) for name in ('a.csv', 'copy.csv')]
+    for path in paths:
+        write_table(Path(path), insertion(1))
+    options = ['--columns', COLUMNS, '--terms', 'tilt', '--order', 'together', '--json']
+    assert main(['identify', 'steering', *paths, *options]) == 0
+    said = capsys.readouterr()
+    assert f'{paths[1]}: the same samples as {paths[0]}: counts once' in said.err
+    assert json.loads(said.out)['media'][tmp_path.name]['recordings'] == 1
+
+
 def test_media_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for k, medium in enumerate(('gel', 'gel', 'fat', 'fat')):
         write_table(tmp_path / f'{medium}_{k}.csv', insertion(k))
