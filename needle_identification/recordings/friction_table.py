@@ -172,37 +172,38 @@ def _own_rows(force: FloatArray, motion: FloatArray) -> tuple[IntArray, str]:
         what = f'force in {many} rows, motion in {np.count_nonzero(motions)}, both in {both}'
         return np.flatnonzero(motions), f'{what}: interpolated to the times of the force'
     rows = np.flatnonzero(forces & motions)
-    kept, every = held_rows(motion[rows, 0], force[rows])
+    kept, every = held_rows(motion[rows], force[rows])
     if every:
         words = f'the motion is measured in every {every} rows, and repeated in the others'
         return rows[kept], f'{words}: interpolated to the times of the force'
     return rows, ''
 
 
-def held_rows(position: FloatArray, force: FloatArray) -> tuple[IntArray, int]:
+def held_rows(motion: FloatArray, force: FloatArray) -> tuple[IntArray, int]:
     """
-    Return the rows in which a position is measured, and their usual distance; 0 if in all rows.
+    Return the rows in which a motion is measured, and their usual distance; 0 if in all rows.
 
-    Positions are repeated if they change at regular distances of two or more rows while the
-    force changes in between. At rest they do not change at all, and counts of an encoder in slow
-    motion change by one count. Therefore only changes by several counts are regarded.
+    A motion, shape (n, k), of positions and perhaps speeds is repeated if it changes at regular
+    distances of two or more rows while the force changes in between. At rest it does not change,
+    and counts of an encoder in slow motion change by one count. Therefore only changes by
+    several counts are regarded.
     """
     none = np.empty(0, dtype=np.int64), 0
-    changed = np.flatnonzero(np.diff(position)) + 1
-    steps = np.abs(np.diff(position))[changed - 1]
-    fast = steps > _COUNTS * steps.min(initial=np.inf)
+    changed = np.flatnonzero(np.diff(motion, axis=0).any(axis=1)) + 1
+    steps = np.abs(motion[changed, 0] - motion[changed - 1, 0])
+    fast = steps > _COUNTS * steps[steps > 0.0].min(initial=np.inf)
     distances, successive = np.diff(changed), fast[1:] & fast[:-1]
     if np.count_nonzero(successive) < _FEWEST or np.mean(distances < 2) > _IRREGULAR:
         return none
     every = round(float(np.median(distances[successive])))
     # Clocks of a robot and a logger differ by up to a row, times of a robot vary.
     usual = np.abs(distances[successive] - every) <= max(1.0, _VARIATION * every)
-    between = np.zeros(len(position), dtype=np.bool_)
+    between = np.zeros(len(motion), dtype=np.bool_)
     for begin, end in zip(changed[:-1][successive], changed[1:][successive], strict=True):
         between[begin + 1 : end] = True
     if every < 2 or np.mean(usual) < _USUAL or not np.diff(force)[between[1:]].any():
         return none
-    starts = [changed[0] % every, *changed, len(position) + _NEXT * every]
+    starts = [changed[0] % every, *changed, len(motion) + _NEXT * every]
     kept = [
         np.arange(begin, max(begin + 1, end - _NEXT * every), every)
         for begin, end in pairwise(starts)

@@ -54,16 +54,21 @@ def test_rests_and_counts_are_no_repetitions() -> None:
     for size in (0.0, 1e-6, 1e-5, 1e-4):
         depth = np.round(made.depth / size) * size if size else made.depth
         for slower in (1.0, 0.1, 0.01):
-            assert held_rows(slower * depth, made.force)[1] == 0
+            assert held_rows(slower * depth[:, None], made.force)[1] == 0
             counts = np.round(slower * made.depth / (size or 1e-7))
-            assert held_rows(counts, made.force)[1] == 0
+            assert held_rows(counts[:, None], made.force)[1] == 0
 
 
-def test_a_force_that_is_repeated_with_the_position_is_no_topic_of_its_own() -> None:
+def test_only_the_whole_motion_is_repeated_and_not_the_force() -> None:
+    """With a speed in each row, positions in some rows are of no importance."""
     made = strokes(seed=1, push=0.0)
     held = np.arange(len(made.time)) // 5 * 5
-    assert held_rows(made.depth[held], made.force)[1] == 5
-    assert held_rows(made.depth[held], made.force[held])[1] == 0
+    depth = made.depth[held, None]
+    assert held_rows(depth, made.force)[1] == 5
+    assert held_rows(depth, made.force[held])[1] == 0
+    assert held_rows(np.column_stack([depth, made.velocity[held]]), made.force)[1] == 5
+    speed = made.velocity + 1e-6 * np.random.default_rng(0).normal(size=len(held))
+    assert held_rows(np.column_stack([depth, speed]), made.force)[1] == 0
 
 
 @pytest.mark.parametrize('has_force', [False, True])
