@@ -50,7 +50,7 @@ _Best: TypeAlias = tuple[Line, FloatArray, FloatArray, SimulatedInsertion]
 
 
 class NoPathError(JobError):
-    """No needle path has a positive clearance; `bound` is an upper bound on the clearance [m]."""
+    """No path has a positive clearance; `bound` limits that of the searched needles [m]."""
 
     def __init__(self, message: str, bound: float) -> None:
         super().__init__(message)
@@ -208,7 +208,8 @@ class _Planner:
         if not bevel and len(lines.entries):
             best = self._straight(lines.entries[0])
         bound = lines.bound
-        bows = self.limits.guide_limit > 0.0 and (bow or bevel)
+        movable = self.limits.guide_limit > 0.0
+        bows = movable and (bow or bevel)
         # Every path ends at the target: its clearance is a bound, too.
         limited = best is not None and best[3].clearance + self.resolution >= self.at_target
         if bows and limited:
@@ -221,6 +222,9 @@ class _Planner:
             best = self._bowed(best, self._candidates(lines, curved), profile, progress)
         if best is None:
             raise self._no_path(lines, bound, bows)
+        if movable and not bows:
+            # Bows are not searched, and so not excluded.
+            bound = self.at_target
         line, guide, depths, found = best
         return Plan(
             needle=self.name,

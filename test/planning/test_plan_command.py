@@ -32,6 +32,21 @@ def test_plan_of_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert plan.resolution == 5e-4
 
 
+def test_bound_holds_for_bows_that_are_not_searched(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a guide that does not move, straight needles are the only ones."""
+    found = []
+    for more in (['--straight'], ['--straight', '--limit', '0'], []):
+        region = ['--entry', '132mm,37mm,-1mm', '--entry-radius', '4mm']
+        assert main([*WORDS, '--target', TARGET, *region, '--json', *more]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    clearance, straight, every = (
+        [one[f'{name} [m]'] for one in found]
+        for name in ('clearance', 'largest straight clearance', 'largest clearance')
+    )
+    assert straight[0] < clearance[2] <= every[0]
+    assert straight[1] == every[1]
+
+
 @pytest.mark.parametrize(
     ('words', 'status', 'message'),
     [
