@@ -32,6 +32,8 @@ from needle_ros.settings import is_number
 import numpy as np
 from numpy.typing import ArrayLike
 
+RESOLUTION: Final = 5e-4  #: Usual resolution of the search [m].
+
 _CANDIDATES: Final = 4  #: Lines for which the best bow is computed.
 _APART: Final = 2e-3  #: Least distance of their entry points [m].
 _PARTS: Final = 16  #: Parts of a line with a largest bow each.
@@ -68,7 +70,7 @@ def find_plan(
     roll: float = 0.0,
     skin_limit: float = SKIN_LIMIT,
     bow: bool = True,
-    resolution: float = 5e-4,
+    resolution: float = RESOLUTION,
     progress: Callable[[str], object] | None = None,
 ) -> Plan:
     """
@@ -357,25 +359,31 @@ class _Planner:
         place = entry + float(found.places[0]) * (self.target - entry)
         name = self.clearance.structure_at(place)
         least, depth = 1e3 * float(found.least[0]), 1e3 * np.linalg.norm(place - entry)
-        text = (
-            f'no straight path to a resolution of {h:g} mm: the best line is {-least:.2f} mm too '
-            f'near to {name}, at a depth of {depth:.1f} mm'
-        )
-        if least > 0.0:
+        text = f'no straight path to a resolution of {h:g} mm'
+        if least <= 0.0:
+            text += (
+                f': the best line is {-least:.2f} mm too near to {name}, at a depth of '
+                f'{depth:.1f} mm'
+            )
+        elif max(self.preset.steering.bevel_load) > 0.0:
             text = (
                 f'no path found for a needle with a bevel, a straight one has a clearance of '
                 f'{least:.2f} mm'
             )
-        if not bows:
-            return NoPathError(text, bound)
         slope = f'slopes up to {STEEPEST:g}, for which the model of the needle holds'
-        if bound <= self.resolution:
-            return NoPathError(f'{text}; no path with a bow either, with {slope}', bound)
-        return NoPathError(
-            f'{text}; no bow was found with {slope}, but it is not excluded (clearance up to '
-            f'{1e3 * bound:.2f} mm)',
-            bound,
-        )
+        if bows and bound <= self.resolution:
+            text += f'; no path with a bow either, with {slope}'
+        elif bows:
+            text += (
+                f'; no bow was found with {slope}, but it is not excluded (clearance up to '
+                f'{1e3 * bound:.2f} mm)'
+            )
+        if lines.bound > RESOLUTION and not (lines.clearances > 0.0).any():
+            text += (
+                '; use a finer --resolution: a straight path with a clearance up to '
+                f'{1e3 * lines.bound:.2f} mm is not excluded'
+            )
+        return NoPathError(text, bound)
 
 
 def _point(name: str, values: ArrayLike) -> FloatArray:
@@ -403,12 +411,12 @@ def _check_inside(anatomies: Sequence[Anatomy], target: FloatArray) -> None:
         index = frame.of_patient(target) / frame.spacing
         if (index >= -0.5).all() and (index <= shape - 0.5).all():
             return
-        corners = frame.to_patient(np.array([np.full(3, -0.5), shape - 0.5]) * frame.spacing)
-        ranges = (f'{1e3 * a:.0f} to {1e3 * b:.0f}' for a, b in np.sort(corners, axis=0).T)
-        shown.append(', '.join(ranges))
-    at = ', '.join(f'{1e3 * one:.1f}' for one in target)
+        corners = frame.to_patient((np.indices((2, 2, 2)).T * shape - 0.5) * frame.spacing)
+        ends = zip(corners.min(axis=(0, 1, 2)), corners.max(axis=(0, 1, 2)), strict=True)
+        shown.append(', '.join(f'{1e3 * a:.2f} to {1e3 * b:.2f}' for a, b in ends))
+    at = ', '.join(f'{1e3 * one:.2f}' for one in target)
     raise ParameterError(
-        f'the target {at} mm is outside the image, whose corners are at {"; ".join(shown)} mm'
+        f'the target {at} mm is outside the image, whose corners are within {"; ".join(shown)} mm'
     )
 
 

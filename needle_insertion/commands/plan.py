@@ -18,7 +18,7 @@ from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import table
 from needle_planning.paths import SKIN_LIMIT
-from needle_planning.planner import find_plan
+from needle_planning.planner import find_plan, RESOLUTION
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import quantities
 from needle_ros.settings import check_whole, LARGEST_SEED
@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ('--skin-limit', 'm', 'largest displacement of the needle at the skin (default 2mm)',
          SKIN_LIMIT),
         ('--roll', 'rad', 'roll of the needle (default 0)', 0.0),
-        ('--resolution', 'm', 'resolution of the search (default 0.5mm)', 5e-4),
+        ('--resolution', 'm', 'resolution of the search (default 0.5mm)', RESOLUTION),
     ):  # fmt: skip
         common.add_quantity(parser, name, unit, meaning, value)
     common.add_flag(parser, '--straight', 'plan a straight needle only')

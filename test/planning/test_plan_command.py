@@ -51,9 +51,10 @@ def test_bound_holds_for_bows_that_are_not_searched(capsys: pytest.CaptureFixtur
     ('words', 'status', 'message'),
     [
         ((f'--target={TARGET}', '--entry', '150mm,0,0'), 1, 'no straight path to a resolution'),
-        (('--target', '-0.4,0,0'), 2, 'the target -400.0, 0.0, 0.0 mm is outside the image'),
+        (('--target', '-0.4,0,0'), 2, 'the target -400.00, 0.00, 0.00 mm is outside the image'),
         (('--target', '55mm,0,-20mm'), 2, 'the target is in portal vein'),
         (('--target', '55mm,0'), 2, '--target must be R,A,S, such as'),
+        ((f'--target={TARGET}', '--resolution', '20mm'), 1, '; use a finer --resolution: a str'),
         ((f'--target={TARGET}', '--entry', 'skin'), 2, 'entry must be one of body, entry,'),
         ((f'--target={TARGET}', '--entry=-1,0,0,2'), 2, '--entry must be R,A,S, such as'),
         ((f'--target={TARGET}', '--entry', '0.3,0,0'), 2, 'is too short: the nearest entry'),

@@ -430,6 +430,31 @@ def test_entry_behind_bone_has_no_path() -> None:
     assert error.value.bound > RESOLUTION
 
 
+@pytest.mark.parametrize('resolution', [0.01, 0.05])
+def test_coarse_resolution_is_named(resolution: float) -> None:
+    """A line that is free, but not by the resolution, has no other reason."""
+    with pytest.raises(NoPathError) as error:
+        find_plan(window(0.0), TARGET, bow=False, resolution=resolution)
+    text = str(error.value)
+    assert text.startswith(f'no straight path to a resolution of {1e3 * resolution:g} mm')
+    assert 'use a finer --resolution: a straight path with a clearance up to ' in text
+    assert 'bevel' not in text
+
+
+def test_all_corners_of_an_oblique_image_are_stated() -> None:
+    """With digits for an image of 4.5 mm x 4.5 mm x 9 mm."""
+    turn = Rotation.from_euler('z', 45.0, degrees=True).as_matrix()
+    labels = np.ones((3, 3, 6), dtype=np.int16)
+    image = Anatomy(
+        labels=labels, to_patient=affine([1.5e-3] * 3, turn),
+        structures={1: Structure(name='skin', role='entry')},
+    )  # fmt: skip
+    with pytest.raises(ParameterError) as error:
+        find_plan(image, (0.0, 0.02, 0.0))
+    # The diagonal is 6.364 mm; the corner of the first voxel is at -1.061 mm.
+    assert str(error.value).endswith('within -3.18 to 3.18, -1.06 to 5.30, -0.75 to 8.25 mm')
+
+
 def test_entry_region_must_have_voxels() -> None:
     anatomy = window()
     labels = np.where(anatomy.labels == ENTRY, 0, anatomy.labels)
