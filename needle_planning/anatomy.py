@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from math import nan
 from typing import Final
@@ -80,3 +80,34 @@ def check_axes(to_patient: FloatArray) -> None:
             f'axes of the voxels have a cosine of {cosines.max():.3g} to each other, at most '
             f'{_PERPENDICULAR:g} is accepted: resample the image on a grid with perpendicular axes'
         )
+
+
+def beside(anatomies: Iterable[Anatomy], target: FloatArray) -> str:
+    """
+    Return a line if a target is in no structure with the role ``target``.
+
+    Parameters
+    ----------
+    anatomies : iterable of Anatomy
+        Images in the same patient coordinates.
+    target : ndarray, shape (3,)
+        Target in patient coordinates [m].
+
+    Returns
+    -------
+    str
+        Names of the structures to reach, and where the target is; empty without such a structure.
+
+    """
+    wanted, here = set[str](), set[str]()
+    for anatomy in anatomies:
+        wanted |= {one.name for one in anatomy.structures.values() if one.role == 'target'}
+        index = np.rint(np.linalg.solve(anatomy.to_patient, np.append(target, 1.0))[:3])
+        if (index < 0).any() or (index >= anatomy.labels.shape).any():
+            continue
+        found = anatomy.structures.get(int(anatomy.labels[tuple(index.astype(int))]))
+        if found is not None and found.role == 'target':
+            return ''
+        here |= {found.name} if found is not None else set()
+    places = ' and '.join(sorted(here)) or 'no structure'
+    return f'the target is not in {" or ".join(sorted(wanted))} (it is in {places})' * bool(wanted)

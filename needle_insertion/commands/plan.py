@@ -17,6 +17,7 @@ from needle_dynamics.needles import DEFAULT_NEEDLE
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import table
+from needle_planning.anatomy import beside
 from needle_planning.paths import SKIN_LIMIT
 from needle_planning.planner import find_plan, RESOLUTION
 from needle_ros.errors import ParameterError
@@ -180,7 +181,10 @@ def run(options: argparse.Namespace) -> int:
 
         common.make_folder(options.slicer)
         files += write_slicer(plan, anatomies, options.slicer)
+    warnings = [one for one in [beside(anatomies, plan.target)] if one]
+    common.print_each('warning', warnings)
     document, text = document_of(plan, seconds), text_of(plan, seconds)
+    document['warnings'] = warnings
     if chance:
         document['simulation'] = chance.document()
         text += f'\n\n{chance_text(chance)}'

@@ -16,14 +16,13 @@ from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle
 from needle_insertion.slicer.link import Frame
 from needle_insertion.slicer.needle import MILLIMETERS
 from needle_insertion.slicer.plan_files import planned_shape, PlannedShape
-from needle_planning.anatomy import Anatomy
+from needle_planning.anatomy import Anatomy, beside
 from needle_planning.labels import anatomy_of, read_labels
 from needle_planning.planner import find_plan
 from needle_planning.voxels import Layer
 from needle_ros.errors import NeedleError, ParameterError, printable
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.settings import flag, text
-import numpy as np
 
 _WAITING: Final = 'waits for the label map SEGMENTATION and a target'
 
@@ -56,7 +55,7 @@ class _Found(NamedTuple):
 
     plan: Plan
     shape: PlannedShape
-    beside: str  #: Name of the structure to reach that does not contain the target, or empty.
+    warning: str  #: Line if the target is in no structure to reach, or empty.
 
 
 class SlicerPlanner:
@@ -159,7 +158,7 @@ class SlicerPlanner:
             # It raises an error after a cancellation.
             progress=lambda _: progress(0, 1),
         )
-        return _Found(plan, planned_shape(plan), _beside(anatomies, at))
+        return _Found(plan, planned_shape(plan), beside(anatomies, at))
 
     def _end_reading(self, job: Job[Any]) -> None:
         try:
@@ -175,7 +174,7 @@ class SlicerPlanner:
     def _end_planning(self, job: Job[Any]) -> None:
         target = _words(self._target)
         try:
-            plan, self.shape, beside = job.result()
+            plan, self.shape, warning = job.result()
         except (NeedleError, MemoryError) as error:
             shown = '; the needle shown is of an earlier plan' * (self.shape is not None)
             self.shape = None
@@ -187,9 +186,9 @@ class SlicerPlanner:
             f'plan for the {target}: {kind}, entry {_point(MILLIMETERS * plan.entry)} mm, '
             f'clearance {MILLIMETERS * plan.clearance:.2f} mm{near}'
         )
-        if beside:
-            line += f'; the target is not in {beside}'
-        severity = Severity.WARNING if beside else Severity.INFO
+        if warning:
+            line += f'; {warning}'
+        severity = Severity.WARNING if warning else Severity.INFO
         if self._settings.output:
             try:
                 write_plan(plan, self._settings.output)
@@ -201,19 +200,6 @@ class SlicerPlanner:
     def _report(self, line: str, severity: Severity = Severity.INFO) -> None:
         self.state = printable(line)
         self._events.add(severity, line)
-
-
-def _beside(anatomies: tuple[Anatomy, ...], target: FloatArray) -> str:
-    """Return the names of the structures to reach if a target [m] is in none of them."""
-    names: set[str] = set()
-    for anatomy in anatomies:
-        found = {n: one.name for n, one in anatomy.structures.items() if one.role == 'target'}
-        index = np.rint(np.linalg.solve(anatomy.to_patient, np.append(target, 1.0))[:3])
-        is_inside = (index >= 0).all() and (index < anatomy.labels.shape).all()
-        if is_inside and int(anatomy.labels[tuple(index.astype(int))]) in found:
-            return ''
-        names |= set(found.values())
-    return ' or '.join(sorted(names))
 
 
 def _point(at: FloatArray) -> str:

@@ -183,7 +183,7 @@ def test_target_beside_its_structure_is_a_warning(labels: Path) -> None:
     table = Table(settings_of(labels))
     table.planner.take_segmentation(segmentation())
     table.planner.take_target(beside(8.0))
-    assert table.finish().endswith('the target is not in tumor')
+    assert table.finish().endswith('the target is not in tumor (it is in no structure)')
     assert table.lines[-1][0] is Severity.WARNING
     assert table.planner.shape is not None
 
@@ -280,7 +280,7 @@ def test_target_while_planning_replaces_the_plan(labels: Path) -> None:
 @pytest.mark.parametrize(
     ('values', 'reason'),
     [
-        ({'labels': 'none.yaml'}, 'none.yaml: No such file'),
+        ({'labels': 'none.yaml'}, 'none.yaml cannot be read: No such file'),
         ({'output': 'no/folder/plan.yaml'}, 'output: no/folder is not a folder'),
         ({'turns': 1}, 'turns must be 0'),
         ({'needle': 'straw'}, 'straw'),

@@ -452,7 +452,7 @@ def test_slicer_ros2_can_subscribe(room: Room) -> None:
         ),
         ({'host': 'localhost'}, 'host must be an IPv4 address such as 127.0.0.1'),
         ({'role': 'both'}, 'role must be one of server, client'),
-        ({'planning.labels': 'none.yaml'}, 'none.yaml: No such file or directory'),
+        ({'planning.labels': 'none.yaml'}, 'none.yaml cannot be read: No such file or directory'),
         ({'planning.turns': 1}, 'turns must be 0'),
     ],
 )

@@ -20,7 +20,8 @@ def test_plan_of_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     """Text, JSON and file have the same plan."""
     file = tmp_path / 'plan.yaml'
     assert main([*WORDS, '--target', TARGET, '--straight', '-o', str(file)]) == 0
-    text = capsys.readouterr().out
+    text, warnings = capsys.readouterr()
+    assert warnings == ''
     assert text.startswith('path found in ')
     assert text.endswith(f'wrote {file}\n')
     assert main([*WORDS, '--target', TARGET, '--straight', '--json']) == 0
@@ -30,6 +31,22 @@ def test_plan_of_the_example(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert f'clearance {1e3 * plan.clearance:.2f} mm to {plan.structure}' in text
     assert np.allclose(plan.target, [0.062, 0.012, 0.01])
     assert plan.resolution == 5e-4
+
+
+@pytest.mark.parametrize(
+    ('target', 'place'), [('90mm,10mm,-5mm', 'liver'), ('120mm,-80mm,10mm', 'no structure')]
+)
+def test_target_beside_its_structure_is_a_warning(
+    target: str, place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / 'plan.html'
+    words = [*WORDS, '--target', target, '--straight', '--page', str(page), '--json']
+    assert main(words) == 0
+    said = capsys.readouterr()
+    line = f'the target is not in tumor (it is in {place})'
+    assert f'warning: {line}\n' in said.err
+    assert json.loads(said.out)['warnings'] == [line]
+    assert f'Warning: {line}.' in page.read_text(encoding='utf-8')
 
 
 def test_bound_holds_for_bows_that_are_not_searched(capsys: pytest.CaptureFixture[str]) -> None:
