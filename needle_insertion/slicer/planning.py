@@ -87,6 +87,8 @@ class SlicerPlanner:
     ) -> None:
         self.state = _WAITING  #: One line for users.
         self.shape = shape  #: Needle of the last plan, None after a failure.
+        #: Whether a peer may show a needle that is not of the newest inputs.
+        self._shown = shape is not None
         self._settings, self._read, self._events, self._start = settings, read, events, start
         self._labels = read_labels(settings.labels)
         #: Newest segmentation, until it is read, and then its anatomies.
@@ -164,7 +166,7 @@ class SlicerPlanner:
         try:
             self._anatomies = job.result()
         except (NeedleError, MemoryError) as error:
-            self.state = printable(f'segmentation refused: {_reason(error)}')
+            self.state = printable(self._failed(f'segmentation refused: {_reason(error)}'))
             self._events.reject(self.state)
             return
         count = sum(len(one.structures) for one in self._anatomies)
@@ -175,10 +177,10 @@ class SlicerPlanner:
         target = _words(self._target)
         try:
             plan, self.shape, warning = job.result()
+            self._shown = True
         except (NeedleError, MemoryError) as error:
-            shown = '; the needle shown is of an earlier plan' * (self.shape is not None)
-            self.shape = None
-            self._report(f'no plan for the {target}: {_reason(error)}{shown}', Severity.ERROR)
+            line = self._failed(f'no plan for the {target}: {_reason(error)}')
+            self._report(line, Severity.ERROR)
             return
         kind = 'bowed' if plan.guide.any() else 'straight'
         near = f' to {plan.structure}' if plan.structure else ''
@@ -196,6 +198,11 @@ class SlicerPlanner:
             except ParameterError as error:
                 line, severity = f'{line}; not written: {error}', Severity.ERROR
         self._report(line, severity)
+
+    def _failed(self, line: str) -> str:
+        """Forget the needle of an earlier plan; return a line that tells that it is shown."""
+        self.shape = None
+        return line + '; the needle shown is of an earlier plan' * self._shown
 
     def _report(self, line: str, severity: Severity = Severity.INFO) -> None:
         self.state = printable(line)

@@ -143,6 +143,21 @@ def test_refused_segmentation_is_one_line(labels: Path, values: Any, reason: str
     assert table.finish().endswith('waits for the label map SEGMENTATION')
 
 
+def test_refused_segmentation_names_the_needle_shown(labels: Path) -> None:
+    """As a failed plan does; nothing is said of a needle that was never shown."""
+    table = Table(settings_of(labels))
+    for shown in (False, True):
+        table.planner.take_segmentation(segmentation(-VALUES))
+        state = table.finish()
+        assert state.startswith('segmentation refused: ')
+        assert ('the needle shown is of an earlier plan' in state) == shown
+        assert table.planner.shape is None
+        table.planner.take_segmentation(segmentation())
+        table.planner.take_target(TARGET)
+        table.finish()
+        assert table.planner.shape is not None
+
+
 @pytest.mark.parametrize(
     ('target', 'reason'),
     [
@@ -158,15 +173,17 @@ def test_failed_plan_is_one_line(labels: Path, tmp_path: Path, target: Any, reas
     table.planner.take_target(TARGET)
     table.finish()
     before = output.read_bytes()
-    table.planner.take_target(np.array(target))
-    state = table.finish()
-    assert state.startswith('no plan for the target (')
-    assert reason in state
-    assert 'the needle shown is of an earlier plan' in state
-    assert len(state.splitlines()) == 1
-    assert table.lines[-1] == (Severity.ERROR, state)
-    assert table.planner.shape is None
-    assert output.read_bytes() == before
+    # Also after a second failure.
+    for _ in range(2):
+        table.planner.take_target(np.array(target))
+        state = table.finish()
+        assert state.startswith('no plan for the target (')
+        assert reason in state
+        assert 'the needle shown is of an earlier plan' in state
+        assert len(state.splitlines()) == 1
+        assert table.lines[-1] == (Severity.ERROR, state)
+        assert table.planner.shape is None
+        assert output.read_bytes() == before
 
 
 def test_segmentation_without_entry_is_one_line(tmp_path: Path) -> None:
