@@ -9,6 +9,7 @@ docs/howto/slicer.md.
 """
 
 from collections.abc import Iterable
+from contextlib import suppress
 from datetime import datetime, timedelta, timezone
 import re
 import struct
@@ -52,6 +53,8 @@ _ROUNDING: Final = 1e-4
 
 #: Sizes of the extended header, of entries and texts of metadata; number of the message.
 _EXTENDED: Final = struct.Struct('>HHII')
+
+_STRING: Final = struct.Struct('>HH')  #: encoding of a STRING, and size of its text [bytes]
 
 _PART: Final = 1 << 20  #: part of a body whose checksum is computed at once [bytes]
 
@@ -207,14 +210,27 @@ def _content(version: int, body: memoryview) -> memoryview:
 
 
 def _message(frame: Frame) -> Any:
-    header, body = bytes(frame.data[: HEADER.size]), bytes(_checked_body(frame))
+    header, body = bytes(frame.data[: HEADER.size]), _checked_body(frame)
     try:
         fields = MessageBase.parse_header(header)
+        content = bytes(_content(fields['header_version'], body))
+        if frame.kind == 'STRING':
+            _check_string(content)
         message = MessageBase.create_message(fields['message_type'])
-        message.unpack(fields, body)
+        # pyigtl does not check the extended header, which is left out here.
+        message.unpack({**fields, 'header_version': 1}, content)
     except _NOT_UNDERSTOOD as error:
         raise MessageError(f'the body of {frame.kind} cannot be read: {error}') from error
     return message
+
+
+def _check_string(content: bytes) -> None:
+    """Check encoding and size of a STRING; pyigtl reads a part, or less than stated."""
+    encoding, size = _STRING.unpack_from(content)
+    if encoding not in (MessageBase.IANA_CHARACTER_SET_ASCII, MessageBase.IANA_CHARACTER_SET_UTF8):
+        raise MessageError(f'its encoding {encoding} is neither ASCII nor UTF-8')
+    if size != (there := len(content) - _STRING.size):
+        raise MessageError(f'it states {size} bytes of text, and has {there}')
 
 
 def _coordinates(message: Any) -> Any:
@@ -222,11 +238,11 @@ def _coordinates(message: Any) -> Any:
     if isinstance(message, TransformMessage):
         return message.matrix[:3, 3]
     if isinstance(message, StringMessage):
-        words = _BETWEEN.split(message.string.strip())
-        try:
-            return [float(word) for word in words]
-        except ValueError as error:
-            raise MessageError(f'it must be three numbers, got {message.string!r}') from error
+        # Python reads 8_0 as 80, and digits of other scripts.
+        if message.string.isascii() and '_' not in message.string:
+            with suppress(ValueError):
+                return [float(word) for word in _BETWEEN.split(message.string.strip())]
+        raise MessageError(f'it must be three numbers, got {message.string!r}')
     places = dict(enumerate(message.positions))
     named = [k for k, name in enumerate(message.names) if name == TARGET]
     if not named and message.device_name == TARGET:

@@ -233,6 +233,55 @@ def test_messages_without_single_target_are_rejected(message: Any, complaint: st
         Interpreter(Registration(), REACH).target(framed(message.pack()))
 
 
+def packed(kind: str, body: bytes, version: int = 1) -> Frame:
+    """Return the frame of a message with a valid checksum."""
+    head = HEADER.pack(version, kind.encode(), TARGET.encode(), 0, 0, len(body), CRC64(body))
+    return framed(head + body)
+
+
+@pytest.mark.parametrize(
+    ('size', 'text', 'complaint'),
+    [
+        (400, '4 80 -2', 'STRING cannot be read: it states 400 bytes of text, and has 7'),
+        (5, '4 80 -20', 'STRING cannot be read: it states 5 bytes of text, and has 8'),
+        (8, '4 8_0 -2', "it must be three numbers, got '4 8_0 -2'"),
+        (7, '4 \u0668 80', "it must be three numbers, got '4 "),
+    ],
+)
+def test_ambiguous_text_is_rejected(size: int, text: str, complaint: str) -> None:
+    """It would be another target."""
+    body = struct.pack('>HH', 106, size) + text.encode()
+    with pytest.raises(MessageError) as caught:
+        Interpreter(Registration(), REACH).target(packed('STRING', body))
+    assert complaint in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'version', 'body', 'complaint'),
+    [
+        ('POINT', 2, bytes(4), 'has no extended header in 4 bytes'),
+        ('POINT', 2, struct.pack('>HHII', 12, 9, 9, 0), 'has 12 bytes, with an extended header'),
+        ('TRANSFORM', 3, struct.pack('>HHII', 99, 0, 0, 0), 'an extended header of 99 and met'),
+        ('STRING', 1, struct.pack('>HH', 9, 0), 'its encoding 9 is neither ASCII nor UTF-8'),
+    ],
+)
+def test_unreadable_body_has_its_reason(
+    kind: str, version: int, body: bytes, complaint: str
+) -> None:
+    with pytest.raises(MessageError) as caught:
+        Interpreter(Registration(), REACH).target(packed(kind, body, version))
+    assert f'the body of {kind} cannot be read: ' in str(caught.value)
+    assert complaint in str(caught.value)
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_target_with_extended_header_and_metadata(kind: Callable[[Any], Any]) -> None:
+    message = kind([4.0, 80.0, -2.0])
+    message.header_version, message.metadata = 2, {'key': 'value'}
+    found = Interpreter(Registration(), REACH).target(framed(message.pack()))
+    np.testing.assert_allclose(found, [4e-3, 0.08, -2e-3], atol=1e-8)
+
+
 def test_points_with_other_names_are_ignored() -> None:
     """Markups for other receivers use the same connection."""
     message = pyigtl.PointMessage(np.ones((3, 3)), names=['a', 'b', 'ENTRY'], device_name='F')
