@@ -289,6 +289,14 @@ def test_browser_shows_live_data(ros_graph: RosGraph, tmp_path: Path, width: int
                 if not one.startswith((origin, origin.replace('http', 'ws'), 'data:'))
             ]  # fmt: skip
             assert others == []
+            # Without its token the page has no buttons, and says why.
+            await tab.open(origin)
+            note = "document.getElementById('looking').innerText"
+            await tab.wait(
+                f"{note} === 'Read-only page: open the address that the command "
+                "printed, with its token.'",
+                'the reason',
+            )
             assert tab.faults == []
 
     with watching(ros_graph.environment, '--control') as (_, url):

@@ -298,6 +298,9 @@ function settle(given) {
   find('playback').hidden = setting.recording === null;
   find('control').hidden = !(setting.control && token);
   find('looking').hidden = setting.recording !== null || (setting.control && token !== '');
+  // Without the token, or without --control.
+  const [plain, opened] = find('looking').children;
+  [plain.hidden, opened.hidden] = [setting.control, !setting.control];
   put(find('source'), setting.recording ? `recording ${setting.recording.name}` : 'live');
   if (!setting.recording) return;
   find('at').max = setting.recording.duration;
