@@ -169,8 +169,8 @@ def _run_modes(needle: str, options: argparse.Namespace) -> int:
     return 0
 
 
-def _read_motion(path: Path) -> _Motion:
-    """Read guide, tilt and roll by depth from a table: ``depth`` and any of `_COLUMNS`."""
+def _read_motion(path: Path, to: float) -> tuple[_Motion, list[str]]:
+    """Read `_COLUMNS` by depth from a table; return them with warnings for a depth `to` [m]."""
     # Imported here, as the report below: the modal model does not need these 0.5 s.
     from needle_identification import RecordingError
     from needle_identification.recordings.tables import column_values, guessed, read_table
@@ -183,12 +183,20 @@ def _read_motion(path: Path) -> _Motion:
             f'{path} must have the columns depth and any of {", ".join(_COLUMNS)}; it has '
             f'{", ".join(read.columns)}'
         )
-    motion = {name: column_values(read, name, column, []) for name, column in found.items()}
+    losses = list(read.losses)
+    motion = {name: column_values(read, name, column, losses) for name, column in found.items()}
     if not all(np.isfinite(values).all() for values in motion.values()):
         raise RecordingError(f'{path} has values that are not numbers')
     if len(motion['depth']) < 1 or not (np.diff(motion['depth']) > 0.0).all():
         raise RecordingError(f'{path}: depth must increase from row to row')
-    return motion
+    first, last = motion['depth'][[0, -1]]
+    # Beyond rounding of units.
+    if last > to * (1.0 + 1e-9):
+        losses.append(
+            f'its depths, {1e3 * first:g} to {1e3 * last:g} mm, continue beyond --to, '
+            f'{1e3 * to:g} mm'
+        )
+    return motion, [f'{path}: {one}' for one in losses]
 
 
 def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
@@ -217,7 +225,8 @@ def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
             f'--to must be beyond --depth, {start:g} m, with at most {_MOST} samples of '
             f'--interval, got {to!r} m and {interval!r} s'
         )
-    motion = _read_motion(options.motion) if options.motion is not None else {}
+    motion, warnings = _read_motion(options.motion, to) if options.motion is not None else ({}, [])
+    common.print_each('warning', warnings)
     insertion = dynamics.Insertion(needle, steering, depth=start, seed=options.seed or 0)
     recorder = report.InsertionRecord(insertion)
     with ProgressLine('simulation', brief=True) as show:

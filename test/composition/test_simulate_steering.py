@@ -93,6 +93,25 @@ def test_invalid_input_is_named(
     assert complaint in said(capsys, *words, status=2)[1]
 
 
+def test_motion_that_is_not_used_is_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a column in mm without a unit, and of rows beyond the target depth."""
+    way = tmp_path / 'way.csv'
+    words = ['--model', 'steering', '--to', '70mm', '--motion', str(way), '--json']
+    way.write_text('depth,guide_x\n0,0\n30,0\n60,3\n')
+    _, warnings = said(capsys, *words)
+    assert warnings == (
+        f'warning: {way}: depth has no unit, taken in SI units: perhaps depth=depth[mm]\n'
+        f'warning: {way}: its depths, 0 to 60000 mm, continue beyond --to, 70 mm\n'
+    )
+    way.write_text('depth [mm],guide_x [mm]\n0,0\n30,0\n70,3\n')
+    assert said(capsys, *words)[1] == ''
+    assert said(capsys, *words[:2], *words[4:])[1] == ''
+    way.write_text('depth [mm],guide_x [mm]\n0,0\n30,0\n71,3\n')
+    assert 'its depths, 0 to 71 mm, continue beyond --to, 70 mm' in said(capsys, *words)[1]
+
+
 @pytest.mark.parametrize(
     ('text', 'complaint'),
     [
