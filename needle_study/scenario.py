@@ -4,6 +4,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import inf, nan
+from numbers import Real
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from needle_dynamics import FloatArray
@@ -56,9 +57,27 @@ class Scenario(ABC):
             self.row({name: float(values[k]) for name, values in samples.items()})
             for k in range(len(streams))
         ]
-        parts = [slice(k, k + self.at_once) for k in range(0, len(rows), self.at_once)]
-        found = [one for part in parts for one in self.insert(rows[part], streams[part])]
-        return {name: np.array([one.get(name, nan) for one in found]) for name in self.metrics}
+        found = list[Mapping[str, float]]()
+        for k in range(0, len(rows), self.at_once):
+            part = slice(k, k + self.at_once)
+            # A function without yield returns None.
+            some = list(self.insert(rows[part], streams[part]) or ())
+            count, valid = len(rows[part]), all(isinstance(one, Mapping) for one in some)
+            if len(some) != count or not valid:
+                raise ParameterError(
+                    f'{type(self).__name__}.insert must yield the metrics of each of {count} '
+                    f'samples by name, got {len(some)}: {some[:1]}'
+                )
+            found += some
+        return {name: np.array([self._value(name, one) for one in found]) for name in self.metrics}
+
+    def _value(self, name: str, found: Mapping[str, float]) -> float:
+        value = found.get(name, nan)
+        if not isinstance(value, (Real, np.bool_)):
+            raise ParameterError(
+                f'{type(self).__name__}.insert: the metric {name} must be a number, got {value!r}'
+            )
+        return float(value)
 
     def row(self, sample: Row) -> dict[str, float]:
         """Return the value of each variable, by default its default."""

@@ -323,6 +323,61 @@ def test_own_scenario_of_a_file_outside(tmp_path: Path, monkeypatch: pytest.Monk
     assert np.array_equal(own['lateral'], np.hypot(own['tip_x'], own['tip_z']))
 
 
+@pytest.mark.parametrize(
+    ('body', 'reason'),
+    [
+        ("yield {'height': 1.0}", "got 1: [{'height': 1.0}]"),
+        ('yield from 20 * [{}]', 'the metrics of each of 10 samples by name, got 20'),
+        ('return None', 'got 0: []'),
+        ('yield from 10 * [1.0]', 'got 10: [1.0]'),
+        ("yield from len(rows) * [{'hit': None}]", 'the metric hit must be a number, got None'),
+        ("yield from len(rows) * [{'height': 'high'}]", "height must be a number, got 'high'"),
+    ],
+)
+def test_faulty_results_of_an_own_scenario_are_one_line(
+    body: str,
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """With its class; no table is written."""
+    name = f'own_{tmp_path.name}'
+    faulty = f'class Faulty(Throw):\n    def insert(self, rows, streams):\n        {body}\n'
+    (tmp_path / f'{name}.py').write_text(_OWN + faulty)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(study_command, 'processes', lambda _: here())
+    file = tmp_path / 'study.yaml'
+    file.write_text(f'scenario: {name}:Faulty\nsamples: 20\n')
+    assert main(['study', str(file), '-o', str(tmp_path / 'out'), '--workers', '1']) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].startswith('error: Faulty.insert')
+    assert reason in said[0]
+    assert not (tmp_path / 'out/samples.parquet').exists()
+
+
+def test_metrics_that_are_sometimes_missing_are_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether a part of the samples has all values, and whether they are Booleans."""
+    some = 'class Some(Throw):\n    def insert(self, rows, streams):\n        for row in rows:\n'
+    some += "            yield {'hit': True} if row['speed'] > 0.5 else {}\n"
+    (tmp_path / 'own_some.py').write_text(_OWN + some)
+    monkeypatch.syspath_prepend(tmp_path)
+    study = build_study(
+        {'scenario': 'own_some:Some', 'samples': 40, 'design': 'random',
+         'population': {'speed': {'uniform': [0.0, 1.0]}}}
+    )  # fmt: skip
+    results = Results(tmp_path / 'results', study)
+    for k in range(40):
+        results.add(k, study.rows(k, 1))
+    results.complete()
+    values = column(results.table, 'hit')
+    assert np.isnan(values).any()
+    assert np.nanmin(values) == 1.0
+
+
 @given(
     kind=st.sampled_from(sorted(KINDS)),
     first=st.floats(0.1, 10.0),
