@@ -73,15 +73,17 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
     of_bad = {name: summary.picked(table, name, bad) for name in listed}
     units = {name: study.scenario.variables[name].unit for name in drawn}
     units[main] = metrics[main].unit
-    hit = probabilities.get('hit')
     cards = [('Samples', f'{study.samples}', f'seed {study.design.seed}, {study.design.name}')]
-    if hit is not None:
-        value, ends = _rounded(hit, '%')
-        cards.append(('Hit', value, _note(ends)))
-    value, ends = _rounded(summary.quantile(values, 0.5, study.design), units[main])
-    unit, _ = _shown(units[main])
-    cards.append((f'Median {main}', f'{value} {unit}', _note(ends, unit)))
-    pictures = [_distribution(main, metrics[main], values)]
+    chances = dict.fromkeys(one for one in (main, 'hit') if one in probabilities)
+    headline = [(one.capitalize(), probabilities[one], '%') for one in chances]
+    pictures = []
+    # Of yes or no, neither median nor distribution tell more than the probability.
+    if units[main]:
+        median = summary.quantile(values, 0.5, study.design)
+        headline.append((f'Median {main}', median, units[main]))
+        pictures.append(_distribution(main, metrics[main], values))
+    refused = probabilities.get('refused')
+    cards += [_card(*one, refused) for one in headline]
     if drawn:
         pictures += _map(main, metrics[main], values, most, study)
     write_page(
@@ -115,9 +117,21 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
         study=yaml.safe_dump(dict(study.document), default_flow_style=None, sort_keys=False),
     )
     for name in order if shares else ():
-        value, ends = _rounded(_influence(shares[name]), '%')
-        cards.append((f'Variance by {name}', value, _note(ends)))
+        kind = ' alone' if shares[name].total is None else ', with interactions'
+        cards.append(_card(f'Variance by {name}{kind}', _influence(shares[name]), '%'))
     return cards
+
+
+def _card(
+    name: str, one: summary.Estimate, unit: str, refused: summary.Estimate | None = None
+) -> tuple[str, str, str]:
+    """Return a main result; without a value, words with the number of refused samples."""
+    if not one.samples:
+        count = 0 if refused is None or not refused.samples else refused.value * refused.samples
+        return name, 'no sample has a value', f'{count:.0f} refused' if count else ''
+    value, ends = _rounded(one, unit)
+    sign = '' if unit == '%' else _shown(unit)[0]
+    return name, f'{value} {sign}'.rstrip(), _note(ends, sign)
 
 
 def _shown(unit: str) -> tuple[str, float]:
@@ -175,7 +189,7 @@ def _distribution(name: str, figure: Metric, values: FloatArray) -> Picture:
 def _map(
     name: str, figure: Metric, values: FloatArray, over: dict[str, FloatArray], study: Study
 ) -> list[Picture]:
-    """Draw the median of a metric over two variables, if both vary."""
+    """Draw the median, or for yes or no the fraction, over two variables, if both vary."""
     if len(over) < 2:
         return []
     inside = np.isfinite(values)
@@ -184,9 +198,10 @@ def _map(
     if any(low == high for low, high in ends) or not inside.any():
         return []
     points, of_points = np.array(list(over.values()))[:, inside], values[inside]
+    kind, middle = ('median', 'median') if figure.unit else ('fraction of', 'mean')
     (medians, *edges, _), (numbers, *_) = (
         binned_statistic_2d(*points, of_points, statistic, count, ends)
-        for statistic in ('median', 'count')
+        for statistic in (middle, 'count')
     )
     shown = _shown(figure.unit)[1] * np.where(numbers >= _FEWEST, medians, nan)
     units = [study.scenario.variables[one].unit for one in over]
@@ -195,7 +210,8 @@ def _map(
     axes = drawing.subplots()
     x, y = (_shown(unit)[1] * at for unit, at in zip(units, edges, strict=True))
     mesh = axes.pcolormesh(x, y, shown.T, cmap='viridis')
-    drawing.colorbar(mesh, label=_head(f'median {name}', figure.unit))
+    drawing.colorbar(mesh, label=_head(f'{kind} {name}', figure.unit))
     axes.set(xlabel=heads[0], ylabel=heads[1])
-    words = f'Median {name} over the two most influential variables. White: too few samples.'
+    words = f'{kind.capitalize()} {name} over the two most influential variables. '
+    words += 'White: too few samples.'
     return [Picture('map', words, drawing)]

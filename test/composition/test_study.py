@@ -515,6 +515,62 @@ def test_pages_limit_the_number_of_samples(
     assert f'>{last}<' in text
 
 
+def page_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: str, **document: Any) -> Any:
+    """Write the page of a scenario of the page on studies; return its cards and its text."""
+    name = f'own_{tmp_path.name}'
+    (tmp_path / f'{name}.py').write_text(f'{_OWN}\n\nclass One(Throw):\n{more}')
+    monkeypatch.syspath_prepend(tmp_path)
+    results = Results(tmp_path / 'out', build_study({'scenario': f'{name}:One', **document}))
+    compute(results, here, 1, lambda _: None)
+    cards = page.write_study(results, tmp_path / 'study.html')
+    return cards, (tmp_path / 'study.html').read_text(encoding='utf-8')
+
+
+@pytest.mark.parametrize(
+    ('design', 'kind'), [('sobol', ' alone'), ('saltelli', ', with interactions')]
+)
+def test_primary_metric_of_yes_or_no_is_a_probability(
+    design: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside the hits, without a median; shares of its variance say of what kind they are."""
+    more = """\
+    metrics = {'success': Metric('', 'above 1 m'), **Throw.metrics}
+    variables = {**Throw.variables, 'wind': Variable(0.0, 'm/s', 'wind')}
+
+    def insert(self, rows, streams):
+        for row, found in zip(rows, super().insert(rows, streams)):
+            yield {**found, 'success': found['height'] + row['wind'] > 1.0}
+"""
+    population = {'speed': {'uniform': [2.0, 6.0]}, 'wind': {'uniform': [-0.1, 0.1]}}
+    document = {'samples': 1600, 'design': design, 'population': population}
+    cards, text = page_of(tmp_path, monkeypatch, more, **document)
+    names = [name for name, *_ in cards]
+    variances = [f'Variance by {name}{kind}' for name in ('speed', 'wind')]
+    assert names[:4] == ['Samples', 'Success', 'Hit', variances[0]]
+    assert variances[1] in names
+    # Speeds above sqrt(2 g) = 4.43 m/s.
+    assert float(cards[1][1].rstrip('%')) == pytest.approx(39.3, abs=3.0)
+    assert 'Fraction of success over the two most' in text
+    assert 'edian success' not in text
+    assert 'Distribution of success' not in text
+
+
+def test_samples_without_a_value_are_words(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the number of those that were refused."""
+    more = """\
+    metrics = {**Throw.metrics, 'refused': Metric('', 'not simulated')}
+
+    def insert(self, rows, streams):
+        return [{'refused': k < 3} for k, _ in enumerate(rows)]
+"""
+    cards, text = page_of(tmp_path, monkeypatch, more, samples=10)
+    words = 'no sample has a value', '3 refused'
+    assert cards[1:] == [('Hit', *words), ('Median height', *words)]
+    assert 'nan' not in text.partition('Probabilities')[0].partition('<dl')[2]
+
+
 def test_page_of_one_sample_has_no_intervals(tmp_path: Path) -> None:
     results = Results(tmp_path / 'results', build_study({**SMALL, 'samples': 1}))
     compute(results, here, 1, lambda _: None)

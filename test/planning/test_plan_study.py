@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+import re
 from typing import Any
 
 from needle_insertion.cli import main
@@ -71,7 +72,7 @@ def test_command_keeps_the_results_of_a_plan(
     words = ['study', str(tmp_path / 'study.yaml'), '-o', str(tmp_path / 'out'), '--workers', '1']
     for _ in range(2):
         assert main(words) == 0
-        assert 'success' in capsys.readouterr().out
+        assert re.search(r'^Success +[\d.]+% .*\nHit ', capsys.readouterr().out, re.MULTILINE)
     plan = Path(files['plan'])
     plan.write_text(plan.read_text() + '# changed\n')
     assert main(words) == 2
