@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import nan
 
 from needle_controller.controller import Controller, ControllerOutput, Measurement
-from needle_controller.hardware import POSITION, Robot, STAMPS
+from needle_controller.hardware import POSITION, Robot
 from needle_controller.laws.law import Axis
 from needle_controller.reference.setpoint import Setpoint
 from needle_controller.safety.safety import SafetyLimits
@@ -176,7 +176,7 @@ class Commissioning:
                 f'the insertion depth is {depth:.6g} m, measured {settings.start_depth:g} m '
                 '(hardware.commissioning.start_depth): hardware.joint or hardware.zero'
             )
-        if self.robot.settings.stamps == STAMPS[0] and (line := self._rate.warning()):
+        if self.robot.settings.stamped and (line := self._rate.warning()):
             raise JobError(line)
         if noise > settings.distance:
             raise JobError(

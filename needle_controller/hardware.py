@@ -107,6 +107,11 @@ class HardwareSettings:
             )
 
     @property
+    def stamped(self) -> bool:
+        """Whether the time of a measurement is that of its header."""
+        return self.stamps == STAMPS[0]
+
+    @property
     def joints(self) -> tuple[str, ...]:
         """Joints of a command, in their order."""
         return self.command_joints or (self.joint,)

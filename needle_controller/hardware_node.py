@@ -17,7 +17,7 @@ from needle_ros.base_node import BaseNode, message_class, NEWEST
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.status import ControllerStatus
-from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.timing import NANOSECONDS, nanoseconds, set_time
 from needle_ros.wire import Reading
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidTopicNameException
@@ -147,7 +147,7 @@ class Driver:
         node, robot = self._node, self.robot
 
         def stamped(take: Callable[[Reading], None]) -> Callable[[Reading], None]:
-            if self._settings.stamps == hardware.STAMPS[0]:
+            if self._settings.stamped:
                 return take
             return lambda reading: take(reading._replace(stamp=node.now()))
 
@@ -218,8 +218,7 @@ class Driver:
         self.robot.configure(controller)
         self._check = Commissioning(settings, self.robot, controller, limits)
         controller.check = self._check.command
-        whole, part = divmod(round(controller.period * NANOSECONDS), NANOSECONDS)
-        self._period = Duration(sec=whole, nanosec=part)
+        set_time(self._period, round(controller.period * NANOSECONDS))
 
     def message(
         self, answer: ForceCommand, depth: float | None, load: float, *, stopped: bool
@@ -241,5 +240,5 @@ class Driver:
             point = JointTrajectoryPoint(**field, time_from_start=self._period)
             return JointTrajectory(joint_names=joints, points=[point])
         message = JointState(name=joints, **{'effort' if pushes else 'position': values})
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
+        set_time(message.header.stamp, stamp)
         return message

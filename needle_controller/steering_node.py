@@ -34,7 +34,7 @@ from needle_ros.settings import from_values
 from needle_ros.status import Diagnosis, node_of, SteeringStatus
 from needle_ros.system_state import Authority
 from needle_ros.system_state_node import SystemStateTopics
-from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.timing import NANOSECONDS, nanoseconds, set_time
 from needle_ros.trajectory_action_node import TrajectoryClient
 from needle_ros.wire import Reading
 import numpy as np
@@ -244,7 +244,7 @@ class SteeringNode(CompiledNode):
             self._trajectory.wait_for_all_acked(_ARRIVAL)
             self._moved = False
         message = Header(frame_id=self.get_fully_qualified_name())
-        message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
+        set_time(message.stamp, stamp)
         processed.publish(message)
 
     def _on_target(self, message: PointStamped) -> None:
@@ -352,15 +352,13 @@ class SteeringNode(CompiledNode):
 
     def _message(self, move: JointMotion) -> JointTrajectory:
         message = JointTrajectory(joint_names=list(move.joints))
-        stamp = message.header.stamp
-        stamp.sec, stamp.nanosec = divmod(move.stamp, NANOSECONDS)
+        set_time(message.header.stamp, move.stamp)
         rows = zip(move.times.tolist(), move.positions, move.velocities, strict=True)
         for time, positions, velocities in rows:
             point = JointTrajectoryPoint(
                 positions=positions.tolist(), velocities=velocities.tolist()
             )
-            since = point.time_from_start
-            since.sec, since.nanosec = divmod(round(time * NANOSECONDS), NANOSECONDS)
+            set_time(point.time_from_start, round(time * NANOSECONDS))
             message.points.append(point)
         return message
 

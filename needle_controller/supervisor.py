@@ -9,7 +9,7 @@ from typing import Final
 from needle_controller.controller import Controller, ControllerSettings, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.gains import AllGains
-from needle_controller.hardware import Robot, STAMPS
+from needle_controller.hardware import Robot
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.input_monitor import InputMonitor, Refusal, REPEATED
@@ -112,7 +112,7 @@ class Supervisor(StateMachine[ForceCommand]):
         """Start to answer measurements; see `watch`."""
         self.fault, self._kind = _WAITING, FaultKind.WAITING
         if self.controller is not None:
-            stamped = self._robot is None or self._robot.settings.stamps == STAMPS[0]
+            stamped = self._robot is None or self._robot.settings.stamped
             self._timing = TimingMonitor(self.controller.settings, stamped=stamped)
         self._begin(now)
         self.safety.count_publishers(publishers)

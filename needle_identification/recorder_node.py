@@ -18,7 +18,7 @@ from needle_ros.errors import MessageError
 from needle_ros.event_log import Severity
 from needle_ros.run_node import run
 from needle_ros.status import Diagnosis, RecorderStatus
-from needle_ros.timing import NANOSECONDS
+from needle_ros.timing import set_time
 from needle_ros.wire import MessageReader
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -213,7 +213,7 @@ class RecorderNode(BaseNode):
         """Publish the stamp [ns] of the newest recorded sample; 0: the plant need not wait."""
         if self._reports.get_subscription_count():
             message = Header(frame_id=self.get_fully_qualified_name())
-            message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
+            set_time(message.stamp, stamp)
             self._reports.publish(message)
 
     def _take_from(self, bag: BagWriter, topic: str, recorded: _Recorded, most: int) -> None:

@@ -14,6 +14,11 @@ def nanoseconds(time: Any) -> int:
     return int(time.sec) * NANOSECONDS + int(time.nanosec)
 
 
+def set_time(time: Any, ns: int) -> None:
+    """Set a builtin_interfaces Time or Duration [ns], as `nanoseconds` reads it."""
+    time.sec, time.nanosec = divmod(ns, NANOSECONDS)
+
+
 def seconds(time: Any) -> float:
     """Convert a builtin_interfaces Time or Duration to s."""
     return float(time.sec + time.nanosec / NANOSECONDS)

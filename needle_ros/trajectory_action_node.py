@@ -13,7 +13,7 @@ from needle_ros.base_node import BaseNode, message_class
 from needle_ros.contract import FOLLOW_JOINT_TRAJECTORY_TYPE, JOINT_TRAJECTORY
 from needle_ros.errors import MessageError, ParameterError, printable
 from needle_ros.requests import Acknowledgement, RequestLog, RequestStatus, Verdict
-from needle_ros.timing import NANOSECONDS, nanoseconds
+from needle_ros.timing import NANOSECONDS, nanoseconds, set_time
 from needle_ros.trajectories import (
     ErrorCode,
     FollowedJoint,
@@ -200,8 +200,7 @@ class TrajectoryAction:
     ) -> Any:
         joints = [followed[name] for name in goal.trajectory.joints]
         feedback = self._action.Feedback(joint_names=[*goal.trajectory.joints])
-        time = feedback.header.stamp
-        time.sec, time.nanosec = divmod(stamp, NANOSECONDS)
+        set_time(feedback.header.stamp, stamp)
         desired = np.array([joint.reference[:3] for joint in joints])
         actual = np.array([joint.actual for joint in joints])
         elapsed = divmod(max(0, stamp - goal.stamp), NANOSECONDS)

@@ -277,15 +277,14 @@ class Safety:
         """Longest time between two checks for missing inputs [s]."""
         return min(0.1, 0.5 * self.streams['joint_states'].timeout / NANOSECONDS)
 
-    def latch(self, reason: str | None) -> bool:
-        """Latch a stop for a reason, if not None; return whether the stop begins now."""
-        if reason is None or self.stop is not None:
-            return False
+    def latch(self, reason: str) -> None:
+        """Latch a stop for a reason; the first reason stays."""
+        if self.stop is not None:
+            return
         self.stop = reason
         self.stops += 1
         # A stop discards the reference, and so the tracking error.
         self.guard.forget('reference')
-        return True
 
     def clear(self, now: int) -> str | None:
         """Release the stop, or return why not; see `obstacle`."""

@@ -10,7 +10,7 @@ from needle_insertion.graph.ros_graph import ACTIVATE, CONFIGURE, Graph, NodePro
 from needle_ros import contract
 from needle_ros.base_node import profile, SENSOR
 from needle_ros.status import PlantStatus
-from needle_ros.timing import NANOSECONDS
+from needle_ros.timing import NANOSECONDS, set_time
 from needle_ros.wire import MessageReader
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -74,7 +74,7 @@ class Witness:
             self.ended = not self._act(RunSample(stamp, time, reading.values[0][0]))
         if self._processed is not None and not self.ended:
             message = Header(frame_id=self._node.get_fully_qualified_name())
-            message.stamp.sec, message.stamp.nanosec = divmod(stamp, NANOSECONDS)
+            set_time(message.stamp, stamp)
             self._processed.publish(message)
 
 

@@ -13,7 +13,7 @@ from needle_ros.contract import Qos, Topic
 from needle_ros.errors import printable
 from needle_ros.requests import RequestStatus
 from needle_ros.status import node_of, NodeStatus, read_status
-from needle_ros.timing import NANOSECONDS
+from needle_ros.timing import set_time
 from rclpy.node import Node
 
 
@@ -62,7 +62,7 @@ def target_message(stamp: int, point: tuple[float, float, float]) -> PointStampe
     """Return a target x, y, z [m] with a stamp [ns]."""
     message = PointStamped()
     message.header.frame_id = contract.ENTRY
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, NANOSECONDS)
+    set_time(message.header.stamp, stamp)
     message.point.x, message.point.y, message.point.z = point
     return message
 

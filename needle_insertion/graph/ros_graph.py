@@ -127,15 +127,8 @@ class Graph:
     the graph claims the domain of the user, open to other machines as set in the environment.
     """
 
-    def __init__(
-        self,
-        logs: Path,
-        executor: Callable[..., Executor] = EventsExecutor,
-        *,
-        shared: bool = False,
-    ) -> None:
+    def __init__(self, logs: Path, *, shared: bool = False) -> None:
         self._logs = logs
-        self._executor_kind = executor
         self._shared = shared
         self._processes: list[NodeProcess] = []
         self._files: list[IO[str]] = []
@@ -157,7 +150,7 @@ class Graph:
         self.environment = {**os.environ, 'ROS_DOMAIN_ID': str(self.domain), END_WITH_PARENT: '1'}
         self.context = Context()
         self.context.init(domain_id=self.domain)
-        self.executor = self._executor_kind(context=self.context)
+        self.executor: Executor = EventsExecutor(context=self.context)
         return self
 
     def __exit__(self, *raised: Any) -> None:

@@ -7,7 +7,7 @@ from time import time_ns
 from typing import Final
 
 from needle_controller.controller import Measurement
-from needle_controller.hardware import Robot, STAMPS
+from needle_controller.hardware import Robot
 from needle_insertion.graph.messages import waiting
 from needle_ros import contract
 from needle_ros.contract import Topic
@@ -81,8 +81,7 @@ class Readings:
     def _state(self) -> Reading | None:
         """Return the newest joint states, with the time of arrival if they have no stamp."""
         reading = self.newest(contract.JOINT_STATES)
-        stamped = self._robot is None or self._robot.settings.stamps == STAMPS[0]
-        if reading is None or stamped:
+        if reading is None or self._robot is None or self._robot.settings.stamped:
             return reading
         return reading._replace(stamp=self._received)
 

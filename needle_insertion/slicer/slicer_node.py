@@ -29,7 +29,7 @@ from needle_ros.publishers_node import request_stamp
 from needle_ros.requests import PendingRequest, RequestStatus
 from needle_ros.run_node import run
 from needle_ros.status import Diagnosis, node_of, SlicerPhase, SlicerStatus
-from needle_ros.timing import NANOSECONDS, nanoseconds, RateCounter
+from needle_ros.timing import nanoseconds, RateCounter, set_time
 from needle_ros.wire import Reading
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ _AT_ONCE: Final = 16  #: largest number of messages per reading
 
 _PACKAGE: Final = 'pyigtl'
 
-#: Name of the receiver of targets until a node has answered.
 #: Modules and kernels of plans.
 _OF_PLANS: Final = ('scipy.optimize', 'scipy.sparse', 'numba.core.boxing')
 _KERNELS: Final = (
@@ -53,7 +52,7 @@ _KERNELS: Final = (
     'needle_dynamics.compiled.cutting_needle',
     'needle_dynamics.compiled.superposition',
 )
-_TAKER: Final = 'controller or steering'
+_TAKER: Final = 'controller or steering'  #: of targets until a node has answered
 
 
 class SlicerNode(BaseNode):
@@ -313,7 +312,7 @@ class SlicerNode(BaseNode):
     def _publish_tip(self, shape: Shape) -> None:
         message = PoseStamped()
         message.header.frame_id = contract.ENTRY
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(shape.stamp, NANOSECONDS)
+        set_time(message.header.stamp, shape.stamp)
         position, turn = message.pose.position, message.pose.orientation
         position.x, position.y, position.z = shape.points[-1].tolist()
         turn.x, turn.y, turn.z, turn.w = shape.turn.tolist()

@@ -211,10 +211,11 @@ def test_stop_cannot_be_cleared_beyond_a_limit() -> None:
     now = 10 * SECOND
     for _ in range(2):
         whole.streams['base_wrench'].check(now, now, 'needle_base', [0.0, 0.0])
-        began = whole.latch(whole.guard.wrench((0.0, 40.0, 0.0), (0.0, 0.0, 0.0)))
-    assert began
-    assert 'axial force 40 N' in whole.stop
-    assert not whole.latch('emergency stop')
+        reason = whole.guard.wrench((0.0, 40.0, 0.0), (0.0, 0.0, 0.0))
+    assert reason is not None
+    whole.latch(reason)
+    whole.latch('emergency stop')
+    assert whole.stop == reason
     assert 'axial force 40 N' in whole.clear(now)
     assert whole.stop is not None
     whole.guard.wrench((0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
@@ -239,7 +240,9 @@ def test_discarded_reference_does_not_block_clearing_the_stop() -> None:
     """The motion restarts from the measured depth."""
     whole = safety()
     whole.guard.tracking(0.02)
-    assert whole.latch(whole.guard.tracking(0.02))
+    reason = whole.guard.tracking(0.02)
+    assert reason is not None
+    whole.latch(reason)
     assert whole.clear(10 * SECOND) is None
 
 
@@ -289,7 +292,9 @@ def test_stop_for_missing_sensors_stays_until_they_are_back() -> None:
     wrench.check(now, now, 'needle_base', [0.0, 0.0])
     later = now + SECOND
     joints.check(later, later)
-    assert whole.latch(whole.warning(later))
+    reason = whole.warning(later)
+    assert reason is not None
+    whole.latch(reason)
     assert 'base_wrench is stale' in whole.clear(later)
     wrench.check(later, later, 'needle_base', [0.0, 0.0])
     assert whole.clear(later) is None
