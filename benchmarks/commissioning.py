@@ -273,7 +273,7 @@ def run(
         value = None
         if answer is not None:
             stopped = supervisor.safety.stop is not None
-            values = adapter.command(answer, 0.0, stopped=stopped)
+            values = adapter.command(answer, supervisor.depth(now), stopped=stopped)
             if values is not None and one.connected:
                 # A driver of named joints moves the named joint.
                 moved = not named or adapter.settings.joint == robot.joint

@@ -339,7 +339,8 @@ class SimulatedController(GraphNode):
         command = Reading(answer.stamp, BASE, (), ((0.0, answer.force, 0.0, 0.0, 0.0, 0.0),))
         if self._adapter is not None:
             stopped = supervisor.safety.stop is not None
-            positions = self._adapter.command(answer, supervisor.bending.load, stopped=stopped)
+            depth, load = supervisor.depth(self.graph.now), supervisor.bending.load
+            positions = self._adapter.command(answer, depth, load, stopped=stopped)
             if positions is None:
                 return
             command = Reading(answer.stamp, '', (SLIDE.joint,), (tuple(positions), (), ()))
