@@ -33,6 +33,7 @@ class Trial(NamedTuple):
     misfit: float  # residual sum of squares
     p_value: float
     growth: float = 1.0  # of the errors by autocorrelated noise that remains
+    samples: float = 0.0  # independent ones of the noise that remains; 0: unknown
 
 
 class Screening:

@@ -43,8 +43,7 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Cand
     chosen = design.signals.settings.terms
     if 'decay' not in chosen:
         design = _with_decay_time(design, fit.residual)
-    samples = _independent_samples(design, fit)
-    comparison = _Comparison(design, fit, design.screening(), samples, SIGNIFICANCE / among)
+    comparison = _Comparison(design, fit, design.screening(), SIGNIFICANCE / among)
     singles = [(term,) for term in _candidates(design)]
     found = comparison.added(singles)
     growth = 1.0 if fit.memory is None else float(fit.memory.inflation.max())
@@ -87,12 +86,11 @@ def _candidates(design: Design) -> list[str]:
 
 
 class _Comparison(NamedTuple):
-    """A fit, its screening, its number of independent samples, and the level of the tests."""
+    """A fit, its screening, and the level of the tests."""
 
     design: Design
     fit: Regression
     screening: Screening
-    samples: float
     level: float
 
     def added(self, candidates: Sequence[tuple[str, ...]]) -> list[CandidateFit]:
@@ -100,7 +98,11 @@ class _Comparison(NamedTuple):
         tried = [self._tried(more) for more in candidates]
         searched = [len(_DECAY_TIMES) if 'decay' in more else 1 for more in candidates]
         p_values = _holm(np.multiply([trial.p_value for trial in tried], searched).tolist())
-        return _simplest(list(map(self._judged, candidates, tried, p_values)))
+        # The residual without a missing term is no noise: samples of the best fit.
+        known = [(trial.misfit, trial.samples) for trial in tried if trial.samples]
+        samples = min(known)[1] if known else _independent_samples(self.design, self.fit)
+        found = zip(candidates, tried, p_values, strict=True)
+        return _simplest([self._judged(*one, samples) for one in found])
 
     def _tried(self, more: tuple[str, ...]) -> Trial:
         """Fit additional terms, with errors for autocorrelated noise if they are significant."""
@@ -120,18 +122,21 @@ class _Comparison(NamedTuple):
                 # (intersection-union test).
                 parts = np.split(which, ends[:-1] if growth < _LIKE_MEMORY else [])
                 p_value = max(wald_test(other, part.tolist()) for part in parts)
-                return Trial(values, errors, True, trial.misfit, p_value, growth)
+                samples = _independent_samples(design, other)
+                return Trial(values, errors, True, trial.misfit, p_value, growth, samples)
         return trial._replace(determined=False, p_value=1.0)
 
-    def _judged(self, more: tuple[str, ...], trial: Trial, p_value: float) -> CandidateFit:
+    def _judged(
+        self, more: tuple[str, ...], trial: Trial, p_value: float, samples: float
+    ) -> CandidateFit:
         settings = self.design.signals.settings
         terms, name = (*settings.terms, *more), ' and '.join(more)
         if not trial.determined:
             words = f'the data do not distinguish the term {name} from the others'
             return CandidateFit(terms=terms, words=words)
         columns = columns_of(more, settings)
-        difference = self.samples * log(trial.misfit / self.screening.misfit)
-        difference += len(columns) * log(self.samples)
+        difference = samples * log(trial.misfit / self.screening.misfit)
+        difference += len(columns) * log(samples)
         firsts = {columns_of([term], settings)[0].name for term in more if term in _POSITIVE}
         found = list(zip(columns, trial.values, trial.errors, strict=True))
         # A mass, breakaway friction or cutting force cannot be negative.
@@ -164,7 +169,8 @@ class _Comparison(NamedTuple):
             return CandidateFit(terms=terms, words=words)
         p_value = wald_test(fit, which)
         misfit = self.screening.misfit_without(which) / self.screening.misfit
-        difference = self.samples * log(misfit) - len(which) * log(self.samples)
+        samples = _independent_samples(self.design, fit)
+        difference = samples * log(misfit) - len(which) * log(samples)
         supported = p_value >= SIGNIFICANCE and difference < 0.0
         words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
         return CandidateFit(

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from scipy.signal import lsim
+from support.strokes import strokes
 
 MU_S, MU_V = 0.2, 250.0
 PLAIN = ('coulomb', 'viscous')
@@ -275,6 +276,15 @@ def test_outliers_of_one_sign_are_not_friction_by_direction() -> None:
         found = identify_friction(replace(recording, force=recording.force + spikes))
         advised += [c for c in found.comparison if c.supported and 'direction' in c.terms]
     assert not advised
+
+
+def test_the_zero_of_the_sensor_is_an_offset_and_not_friction_by_direction() -> None:
+    """The residual without the offset is no noise, and does not count independent samples."""
+    made = [strokes(seed=seed, push=0.0, offset=0.4) for seed in range(20, 40)]
+    # One of fifty may be wrong; 8 of 20 were `direction` with a gain of BIC five times too large.
+    assert [advised(identify_friction(one)) for one in made].count(['offset']) >= 19
+    other = [identify_friction(strokes(seed=k, push=0.0, withdrawal=1.1)) for k in range(5)]
+    assert [advised(one) for one in other] == [['direction']] * 5
 
 
 def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
