@@ -47,6 +47,8 @@ def fit_warnings(
     if unknown:
         yield f'the data do not determine {", ".join(unknown)}: use more speeds, or fewer terms'
     settings = design.signals.settings
+    if 'coulomb_friction' not in unknown:
+        yield from _of_zero(design)
     if 'stribeck' in settings.terms and not design.reaches('stribeck'):
         slowest = float(np.abs(design.velocity[design.used]).min())
         yield (
@@ -86,6 +88,16 @@ def fit_warnings(
     if {'moving_mass', 'viscous_friction'} <= set(known):
         mass = 1e-3 * known['viscous_friction'].value
         yield f'a lag of the force of 1 ms looks like {-mass:.2g} kg of moving_mass'
+
+
+def _of_zero(design: Design) -> Iterator[str]:
+    """Warn if the data do not distinguish the zero of the force sensor from mu_s."""
+    terms = design.signals.settings.terms
+    if 'coulomb' not in terms or 'offset' in terms:
+        return
+    if not design.screening().tried(design.columns(['offset'])[design.used]).determined:
+        cure = '' if 'direction' in terms else ', or record both directions'
+        yield f'mu_s includes the zero of the force sensor: tare it before contact{cure}'
 
 
 def _of_lag(lag: ParameterEstimate, coarse: float, design: Design) -> Iterator[str]:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from scipy.signal.windows import hann
-from support.strokes import COULOMB, SPEEDS, strokes, VISCOUS
+from support.strokes import COULOMB, NOISE, SPEEDS, strokes, VISCOUS
 
 TRUTH = {'coulomb_friction': COULOMB, 'viscous_friction': VISCOUS}
 
@@ -422,6 +422,20 @@ def test_strokes_in_one_direction_do_not_determine_an_offset() -> None:
     found = identify_friction(law(varied, both_ways=False), settings('offset'))
     known = {parameter.name: parameter.determined for parameter in found.parameters}
     assert known == {'coulomb_friction': False, 'viscous_friction': True, 'offset': False}
+
+
+def test_mu_s_includes_a_zero_of_the_sensor_that_nothing_determines() -> None:
+    """It is named for strokes in one direction, and for friction by direction."""
+    tare = 'mu_s includes the zero of the force sensor'
+    for seed in range(3):
+        noise = np.random.default_rng(seed).normal(scale=NOISE, size=2000)
+        one_way, both = (law(varied, both_ways=ways, offset=1.0) for ways in (False, True))
+        found = identify_friction(replace(one_way, force=one_way.force + noise))
+        assert within(found['coulomb_friction'], COULOMB + 1.0)
+        assert any('record both directions' in words for words in found.warnings)
+        for terms, named in (((), False), (('offset',), False), (('direction',), True)):
+            found = identify_friction(replace(both, force=both.force + noise), settings(*terms))
+            assert any(tare in words for words in found.warnings) == named
 
 
 def test_the_breakaway_force_needs_a_rest_with_a_rising_force() -> None:
