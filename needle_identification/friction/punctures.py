@@ -41,8 +41,11 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
     width, reach = signals.correlation, signals.half_filter
     if np.ptp(signals.depth) == 0.0:
         return ()
-    x = design.regressors(signals.settings.terms)
-    force = signals.force - x[:, : len(fit.values)] @ np.nan_to_num(fit.values)
+    if fit.determined.all():
+        force = signals.force - design.regressors(signals.settings.terms) @ fit.values
+    else:
+        # The friction is known where it was fitted.
+        force, inward = fit.residual, inward & design.used
     explained = signals.force - force
     drops, others = np.full(len(force), np.nan), np.zeros(len(force))
     inner = stretches(inward) + np.array([signals.margin, -signals.margin])
@@ -67,7 +70,8 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
     left = np.where(known & (drops > np.maximum(clear, 0.0)), drops, 0.0)
     while noise > 0.0 and left.any():
         peak = int(np.argmax(left))
-        found.append(_puncture(design, force, peak, noise))
+        one = _puncture(design, force, peak, noise)
+        found += [one] if one.drop.interval[0] > 0.0 else []
         left[max(0, peak - 2 * (width + reach)) : peak + 2 * (width + reach)] = 0.0
     return tuple(sorted(found, key=lambda one: one.time))
 

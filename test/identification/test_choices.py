@@ -174,6 +174,30 @@ def test_punctures_are_detected_and_located() -> None:
     assert min(found_of.values()) >= 6
 
 
+def one_stroke(seed: int, speed: float, drop: float = 0.0) -> Recording:
+    """Simulate an insertion by 30 mm that ends gradually, with a puncture after half of it."""
+    corners = 0.5 + np.cumsum([0.0, 0.1, 0.03 / speed, 0.1])
+    time = np.arange(0.0, corners[-1] + 0.5, 0.004)
+    velocity = np.interp(time, corners, [0.0, speed, speed, 0.0])
+    s = np.cumsum(velocity) * 0.004
+    force = MU_S * np.sign(velocity) + MU_V * velocity
+    force += np.where((velocity > 0.0) & (s < 0.015), drop, 0.0)
+    noise = 0.01 * np.random.default_rng(seed).standard_normal(len(time))
+    return Recording(name='one', time=time, depth=s, velocity=velocity, force=force + noise)
+
+
+@pytest.mark.parametrize('speed', [0.005, 0.03])
+def test_the_end_of_a_stroke_is_no_puncture(speed: float) -> None:
+    """One speed does not separate mu_s from mu_v: the friction of other speeds is unknown."""
+    for seed in range(10):
+        found = identify_friction(one_stroke(seed, speed))
+        assert any('do not determine' in words for words in found.warnings)
+        assert not found.punctures
+        (one,) = identify_friction(one_stroke(seed, speed, drop=0.4)).punctures
+        # Four standard errors.
+        assert abs(one.drop.value - 0.4) < 4.0 * one.drop.error
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_presliding_samples_are_discarded(seed: int) -> None:
     """Friction that builds up over 0.2 mm after each reversal is not sliding friction."""
