@@ -25,10 +25,17 @@ from needle_identification.friction.design import Design, select_samples
 from needle_identification.friction.estimate import Fit, FrictionEstimate
 from needle_identification.friction.filtering import filter_signals, FilteredSignals, HALF_LENGTH
 from needle_identification.friction.intervals import parameter_estimates
-from needle_identification.friction.lag import find_lag, lag_estimate, velocity_delay
+from needle_identification.friction.lag import (
+    find_lag,
+    lag_estimate,
+    SAME_SCALE,
+    velocity_delay,
+    velocity_scale,
+)
 from needle_identification.friction.punctures import find_punctures
 from needle_identification.friction.settings import AUTO, FrictionSettings
 from needle_identification.recordings.recording import Recording
+from needle_identification.recordings.units import UNITS
 import numpy as np
 
 _HIDDEN: Final = 0.2  # largest velocity noise threshold, as a fraction of the median speed
@@ -86,16 +93,21 @@ def identify_friction(
     """
     settings = settings or FrictionSettings()
     alternatives: tuple[_Alternative, ...] = (_with_low_pass, _without_transitions)
-    if settings.estimator == AUTO:
+    automatic = settings.estimator == AUTO
+    if automatic:
         settings = replace(settings, estimator='ordinary')
         alternatives = (_from_positions, _with_low_pass, _with_total, _without_transitions)
+    remarks: tuple[str, ...] = ()
     try:
-        chosen = _fitted(filter_signals(recording, settings))
+        signals = filter_signals(recording, settings)
+        recording, signals, remarks = _compared(recording, signals, automatic)
+        chosen = _fitted(signals, *remarks)
         for alternative in alternatives:
             chosen = alternative(recording, chosen) or chosen
         return _finished(recording.name, chosen, among)
     except IdentificationError as error:
-        raise IdentificationError(f'{recording.name}: {error}') from None
+        words = '; '.join((str(error), *remarks))
+        raise IdentificationError(f'{recording.name}: {words}') from None
 
 
 class _Candidate(NamedTuple):
@@ -128,6 +140,32 @@ def _fitted(signals: FilteredSignals, *remarks: str) -> _Candidate:
     design = select_samples(signals, coarse, abs(coarse) + error)
     design.check()
     return _Candidate(design, design.solve(settings.terms, settings.estimator), coarse, remarks)
+
+
+def _compared(
+    recording: Recording, signals: FilteredSignals, automatic: bool
+) -> tuple[Recording, FilteredSignals, tuple[str, ...]]:
+    """Compare the scale of the velocity with the positions, which replace it if ``automatic``."""
+    found = velocity_scale(recording)
+    if found is None or recording.velocity is None:
+        return recording, signals, ()
+    ratio, error = found
+    unit, own = _unit_of('speed', 1.0 / ratio), _unit_of('depth', ratio)
+    words = f'the speed is {ratio:.4g} ± {error:.2g} times the change of the positions'
+    words += f' (speed in {unit}?)' if unit else f' (depth in {own}?)' if own else ''
+    if own or not automatic:
+        return recording, signals, (words,)
+    alone = replace(recording, velocity=None)
+    positions = filter_signals(alone, signals.settings)
+    apart = abs(1.0 - 1.0 / ratio) * float(np.std(recording.velocity))
+    if positions.velocity_noise > _CLEANER * apart:
+        return recording, signals, (words,)
+    return alone, positions, (f'{words}: took the speed from the positions',)
+
+
+def _unit_of(role: str, size: float) -> str:
+    units = UNITS[role].items()
+    return next((unit for unit, its in units if abs(size / its - 1.0) < SAME_SCALE), '')
 
 
 def _from_positions(recording: Recording, chosen: _Candidate) -> _Candidate | None:

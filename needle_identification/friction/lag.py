@@ -10,6 +10,7 @@ step is part of the friction regression.
 from math import hypot, sqrt
 from typing import Final
 
+from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import Design, FEWEST_SAMPLES, select_samples
@@ -35,6 +36,7 @@ _SPLINE_ERROR: Final = 10.0
 
 _CERTAIN: Final = 5.0  # smallest delay of a velocity [standard errors]
 _DELAY_PARTS: Final = 0.1  # length of the differences that show it [s]
+SAME_SCALE: Final = 0.01  #: largest error of the scale of a velocity that is not named
 
 _UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
 
@@ -98,25 +100,46 @@ def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
 
 def velocity_delay(recording: Recording) -> float:
     """Return the delay of the recorded velocity behind the positions [s]; 0 if not significant."""
+    change, travel, depth = _changes(recording)
+    # A filter, T v' + v = s', integrates to s - travel = T v; the second column is a scale error.
+    delay, error = _first((change, travel), depth - travel)
+    period = float(np.median(np.diff(recording.time)))
+    return delay if delay > max(period, _CERTAIN * error) else 0.0
+
+
+def velocity_scale(recording: Recording) -> tuple[float, float] | None:
+    """Return the ratio of velocity and positions, and its error; None if it may be one."""
+    change, travel, depth = _changes(recording)
+    # Noise of the velocity raises the second ratio, noise of the positions reduces the first.
+    (low, error), (inverse, _) = _first((depth, change), travel), _first((travel, change), depth)
+    if not (low > 0.0 and inverse > 0.0):
+        return None
+    ratio, error = 0.5 * (low + 1.0 / inverse), hypot(error, 0.5 * (1.0 / inverse - low))
+    return (ratio, error) if abs(ratio - 1.0) > max(SAME_SCALE, _CERTAIN * error) else None
+
+
+def _changes(recording: Recording) -> FloatArray:
+    """Return the changes of velocity, its integral and depth over parts, (3, m)."""
     time, velocity = recording.time, recording.velocity
     if velocity is None:
-        return 0.0
+        return np.zeros((3, 0))
     ends = np.searchsorted(time, np.arange(time[0], time[-1], _DELAY_PARTS))
     travel = np.concatenate(
         [[0.0], np.cumsum(0.5 * np.diff(time) * (velocity[1:] + velocity[:-1]))]
     )
-    x = np.diff(np.stack([velocity, travel])[:, ends]).T
-    missing = np.diff((recording.depth - travel)[ends])
-    gram = x.T @ x
-    free = len(missing) - x.shape[1]
+    return np.asarray(np.diff(np.stack([velocity, travel, recording.depth])[:, ends]))
+
+
+def _first(columns: tuple[FloatArray, FloatArray], response: FloatArray) -> tuple[float, float]:
+    """Return the first coefficient of a fit of two columns and its error; zeros if unknown."""
+    x = np.column_stack(columns)
+    gram, free = x.T @ x, len(x) - x.shape[1]
     if free < 1 or np.linalg.matrix_rank(gram) < len(gram):
-        return 0.0
-    # A filter, T v' + v = s', integrates to s - travel = T v; the second column is a scale error.
-    delay, scale = np.linalg.solve(gram, x.T @ missing)
-    left = missing - x @ [delay, scale]
+        return 0.0, 0.0
+    values = np.linalg.solve(gram, x.T @ response)
+    left = response - x @ values
     error = sqrt(float(left @ left) / free * float(np.linalg.inv(gram)[0, 0]))
-    period = float(np.median(np.diff(time)))
-    return float(delay) if delay > max(period, _CERTAIN * error) else 0.0
+    return float(values[0]), error
 
 
 def lag_estimate(design: Design, fit: Regression) -> ParameterEstimate:

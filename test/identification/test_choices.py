@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from math import exp, log
 import re
@@ -14,12 +15,13 @@ from needle_dynamics import ParameterError
 from needle_identification import (
     FrictionEstimate,
     FrictionSettings,
+    IdentificationError,
     identify_friction,
     Recording,
     summarize,
 )
 from needle_identification.friction.filtering import cut_off, low_pass_taps
-from needle_identification.friction.lag import velocity_delay
+from needle_identification.friction.lag import velocity_delay, velocity_scale
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
@@ -223,6 +225,37 @@ def test_velocities_filtered_by_the_driver_are_replaced(seed: int) -> None:
     plain, _ = recorded(NoiseKind(speed_noise=1e-3), generator)
     assert velocity_delay(plain) == 0.0
     assert velocity_delay(replace(recording, velocity=None)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ('ratio', 'said'), [(1000.0, 'speed in mm/s'), (1.1, ''), (0.95, ''), (1e-3, 'depth in mm')]
+)
+def test_a_velocity_with_another_scale_than_the_positions_is_named(
+    ratio: float, said: str
+) -> None:
+    """The positions replace it, unless the unit of the depth is as probable."""
+    for seed in range(5):
+        recording, truth = recorded(NoiseKind(speed_noise=1e-5), np.random.default_rng(seed))
+        assert velocity_scale(recording) is None
+        assert recording.velocity is not None
+        wrong = replace(recording, velocity=ratio * recording.velocity)
+        found_ratio, error = velocity_scale(wrong) or (0.0, 0.0)
+        assert abs(found_ratio / ratio - 1.0) < 1e-3
+        assert error < 1e-3 * ratio
+        found = identify_friction(wrong, FrictionSettings(moving_speed=1e-8))
+        (words,) = (words for words in found.warnings if 'times the change' in words)
+        assert said in words
+        assert ('took the speed from the positions' in words) == (ratio > 0.01)
+        true = truth['viscous_friction'] / (1.0 if ratio > 0.01 else ratio)
+        assert abs(found['viscous_friction'].value - true) < 4.0 * found['viscous_friction'].error
+    # A chosen estimator keeps the velocity; motion in mm/s seems to accelerate too much.
+    said = 'times the change'
+    with pytest.raises(IdentificationError, match=said) if ratio > 2.0 else nullcontext():
+        asked = identify_friction(wrong, FrictionSettings(estimator='ordinary', moving_speed=1e-8))
+        (words,) = (words for words in asked.warnings if said in words)
+        assert 'took the speed' not in words
+    plain, _ = recorded(NoiseKind(speed_noise=5e-3), np.random.default_rng(0))
+    assert velocity_scale(plain) is None
 
 
 def holding(found: FrictionEstimate, truth: Mapping[str, float]) -> int:
