@@ -212,6 +212,8 @@ def _growth(
 ) -> FloatArray:
     """Return the intervals of mixtures of normal distributions relative to white noise."""
     normal = float(ndtri(1.0 - 0.5 * outside))
+    # A column of zeros has no error, and no growth.
+    deviations, white = (np.where(white > 0.0, one, 1.0) for one in (deviations, white))
     low, high = (normal * limit(deviations, axis=0) for limit in (np.min, np.max))
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)

@@ -7,11 +7,13 @@ before and after each sample, over one correlation length of the filter and with
 friction, are compared; a puncture is a drop clearly above the usual changes by noise and tissue.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from math import hypot, sqrt
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
+from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.memory import stretches
 from needle_identification.estimation.regression import DEVIATION_OVER_MEDIAN, Regression
@@ -41,8 +43,13 @@ def find_punctures(design: Design, fit: Regression) -> tuple[Puncture, ...]:
     width, reach = signals.correlation, signals.half_filter
     if np.ptp(signals.depth) == 0.0:
         return ()
+    terms = signals.settings.terms
+    if 'viscous' not in terms:
+        # The force falls with the speed all the same.
+        with suppress(IdentificationError):
+            fit, terms = design.solve((*terms, 'viscous'), 'ordinary'), (*terms, 'viscous')
     if fit.determined.all():
-        force = signals.force - design.regressors(signals.settings.terms) @ fit.values
+        force = signals.force - design.regressors(terms) @ fit.values
     else:
         # The friction is known where it was fitted.
         force, inward = fit.residual, inward & design.used

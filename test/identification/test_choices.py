@@ -200,6 +200,13 @@ def test_the_end_of_a_stroke_is_no_puncture(speed: float) -> None:
         assert abs(one.drop.value - 0.4) < 4.0 * one.drop.error
 
 
+def test_friction_that_falls_with_the_speed_is_no_puncture_without_its_term() -> None:
+    for seed in range(5):
+        for speed in (0.01, 0.02):
+            made = one_stroke(seed, speed)
+            assert not identify_friction(made, FrictionSettings(terms=('coulomb',))).punctures
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_presliding_samples_are_discarded(seed: int) -> None:
     """Friction that builds up over 0.2 mm after each reversal is not sliding friction."""

@@ -193,3 +193,12 @@ def test_exact_data_and_few_data_give_white_noise() -> None:
     for residual in (np.zeros(40), np.r_[1.0, np.zeros(39)]):
         few = divided(np.arange(40) < (40 if not residual.any() else 5), LENGTH)
         assert_array_equal(memory_of(residual, ones, ones / 40, few).inflation, 1.0)
+
+
+def test_a_column_of_zeros_has_no_growth() -> None:
+    """Such as the lag of a force that does not depend on the velocity."""
+    residual = colored(np.random.default_rng(0), 2000, 20.0)
+    x = np.column_stack([np.ones(2000), np.zeros(2000)])
+    found = memory_of(residual, x, x / 2000, divided(np.ones(2000, dtype=np.bool_), LENGTH))
+    assert found.inflation[0] > 1.0
+    assert found.inflation[1] == found.far[1] == 1.0
