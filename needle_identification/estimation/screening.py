@@ -39,25 +39,42 @@ class Trial(NamedTuple):
 class Screening:
     """Least squares fit of the used samples, to which additional columns are added on trial."""
 
-    def __init__(self, regressors: FloatArray, response: FloatArray, parts: Parts) -> None:
-        self._x = regressors / _norms(regressors)
+    def __init__(
+        self,
+        regressors: FloatArray,
+        response: FloatArray,
+        parts: Parts,
+        noise: FloatArray | float = 0.0,
+    ) -> None:
+        norms = _norms(regressors)
+        self._x = regressors / norms
+        self._noise = np.broadcast_to(noise / norms, self._x.shape)
         self._gram = self._x.T @ self._x
         self._moment = self._x.T @ response
         self._power = float(response @ response)
         self._inverse = np.linalg.pinv(self._gram, hermitian=True)
-        self._residual = response - self._x @ (self._inverse @ self._moment)
+        values = self._inverse @ self._moment
+        self._residual = response - self._x @ values
+        self._blur = self._noise @ values
         self._starts = np.concatenate([[0], np.cumsum(parts.sizes)[:-1]]).astype(np.int_)
         self.misfit = float(self._residual @ self._residual)
 
-    def tried(self, columns: FloatArray) -> Trial:
-        """Fit with additional columns (n, q) of the used samples."""
+    def tried(self, columns: FloatArray, noise: FloatArray | float = 0.0) -> Trial:
+        """
+        Fit with additional columns (n, q) of the used samples.
+
+        ``noise`` is the change of the columns by a standard deviation of a noise that they share
+        with the columns of the fit.
+        """
         norms = _norms(columns)
         z = columns / norms
         k, q = len(self._gram), z.shape[1]
         both = self._x.T @ z
-        rest = z - self._x @ (self._inverse @ both)
+        part = self._inverse @ both
+        rest, blur = z - self._x @ part, noise / norms - self._noise @ part
         inner = np.linalg.pinv(rest.T @ rest, hermitian=True)
-        values = inner @ (rest.T @ self._residual)
+        # A shared noise e changes z and y - X b: E[z(v + e) e] = var(e) E[z'(v + e)] (Stein).
+        values = inner @ (rest.T @ self._residual + blur.T @ self._blur)
         left = self._residual - rest @ values
         scores = self._scores(rest, left)
         free = len(self._starts) - k - q

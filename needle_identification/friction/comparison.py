@@ -107,7 +107,8 @@ class _Comparison(NamedTuple):
     def _tried(self, more: tuple[str, ...]) -> Trial:
         """Fit additional terms, with errors for autocorrelated noise if they are significant."""
         design, settings = self.design, self.design.signals.settings
-        trial = self.screening.tried(design.columns(more)[design.used])
+        used = design.used
+        trial = self.screening.tried(design.columns(more)[used], design.column_noise(more)[used])
         if not trial.determined or trial.p_value >= SIGNIFICANCE:
             return trial
         which = list(range(design.terms, design.terms + len(trial.values)))
@@ -121,7 +122,9 @@ class _Comparison(NamedTuple):
                 # Two terms that explain all slow noise are missing if each of them is
                 # (intersection-union test).
                 parts = np.split(which, ends[:-1] if growth < _LIKE_MEMORY else [])
-                p_value = max(wald_test(other, part.tolist()) for part in parts)
+                p_values = [wald_test(other, part.tolist()) for part in parts]
+                # Only the screening allows for noise of the velocity in the columns.
+                p_value = max(trial.p_value, *p_values)
                 samples = _independent_samples(design, other)
                 return Trial(values, errors, True, trial.misfit, p_value, growth, samples)
         return trial._replace(determined=False, p_value=1.0)

@@ -71,8 +71,11 @@ class Design:
 
     def screening(self) -> Screening:
         """Return the least squares fit of the chosen terms, for additional terms on trial."""
-        x = self.regressors(self.signals.settings.terms)
-        return Screening(x[self.used], self.signals.force[self.used], self.parts)
+        terms = self.signals.settings.terms
+        x, noise = self.regressors(terms), self.column_noise(terms)
+        noise = np.column_stack([noise, np.zeros_like(self.lag_column)])
+        used = self.used
+        return Screening(x[used], self.signals.force[used], self.parts, noise[used])
 
     def regressors(self, terms: Sequence[str]) -> FloatArray:
         """Return the regressors of terms and of an estimated lag, shape (n, k)."""
@@ -94,6 +97,12 @@ class Design:
         sign = signals.sign if signals.settings.reversals else np.sign(velocity)
         motion = NeedleMotion(velocity, self.acceleration, time, depth, self.fresh, sign)
         return regressors(motion, terms, signals.settings)
+
+    def column_noise(self, terms: Sequence[str]) -> FloatArray:
+        """Return the change of terms by a standard deviation of the velocity noise, (n, k)."""
+        noise = self.signals.velocity_noise
+        less, more = (replace(self, velocity=self.velocity + e) for e in (-noise, noise))
+        return 0.5 * (more.columns(terms) - less.columns(terms))
 
     def reaches(self, term: str) -> bool:
         """Test whether enough samples lie where a term has an effect."""

@@ -351,6 +351,25 @@ def test_the_zero_of_the_sensor_is_an_offset_and_not_friction_by_direction() -> 
     assert [advised(one) for one in other] == [['direction']] * 5
 
 
+@pytest.mark.parametrize(
+    ('noise', 'breakaway', 'terms'), [(3e-6, 0.0, []), (1e-6, 0.0, []), (1e-6, 0.1, ['stribeck'])]
+)
+def test_noise_of_the_positions_is_no_friction_near_rest(
+    noise: float, breakaway: float, terms: list[str]
+) -> None:
+    """It is in the velocity and in the column of `stribeck`, which is not linear in it."""
+    kind = NoiseKind(
+        positions_only=True,
+        position_noise=noise,
+        position_counts=0.0,
+        speeds=(5e-4, 15e-3),
+        truth={'stribeck_friction': breakaway},
+    )
+    for seed in range(6):
+        found = identify_friction(recorded(kind, np.random.default_rng(seed))[0])
+        assert advised(found) == terms
+
+
 def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
     recording, truth = recorded(NoiseKind(speed_noise=1e-3), np.random.default_rng(3))
     found = identify_friction(recording)
