@@ -45,7 +45,8 @@ def fit_warnings(
     """Yield warnings; ``coarse`` is the corrected lag [s] if ``lag`` is not determined."""
     unknown = [parameter.name for parameter in parameters if not parameter.determined]
     if unknown:
-        yield f'the data do not determine {", ".join(unknown)}: use more speeds, or fewer terms'
+        cure = f'use more speeds, or fewer terms{design.signals.noise_remedy}'
+        yield f'the data do not determine {", ".join(unknown)}: {cure}'
     settings = design.signals.settings
     if 'coulomb_friction' not in unknown:
         yield from _of_zero(design)

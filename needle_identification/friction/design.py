@@ -192,7 +192,7 @@ class Design:
                 f'steady motion above {signals.settings.moving_speed:g} m/s must last '
                 f'{needed:.3g} s in all, lasts '
                 f'{np.count_nonzero(self.used) * signals.period:.3g} s: move longer, or choose '
-                'another axis, topic or column'
+                f'another axis, topic or column{signals.noise_remedy}'
             )
         force = signals.force[self.used]
         if np.ptp(force) == 0.0:

@@ -29,6 +29,8 @@ HALF_LENGTH: Final = 0.36  #: half of a Hann window [periods of its cutoff at ha
 CORRELATION_LENGTH: Final = 3.0  #: of filtered noise [periods of the cutoff]
 GAP: Final = 3.5  #: longest step between samples that is not a gap [sampling periods]
 _CLEARLY: Final = 5.0  # speed above which the needle moves [standard deviations of the noise]
+_SIGNAL: Final = 1.5  # least root mean square of the speed in motion [standard deviations]
+_HIDES: Final = 10.0  # largest one that is hidden by noise, likewise
 _KEPT: Final = 8.0  # samples per period of the cutoff that are kept after the filter
 _LONGER: Final = 3  # hold time at a limit of the sensor over the longest at other values
 _MOST_CUT_OFF: Final = 0.5  # largest fraction of samples that may count as saturated
@@ -65,6 +67,21 @@ class FilteredSignals:
     @property
     def moving_speed(self) -> float:
         return max(self.settings.moving_speed, _CLEARLY * self.velocity_noise)
+
+    @property
+    def noise_words(self) -> str:
+        return (
+            f'noise of {self.velocity_noise:.2g} m/s in the speed hides motion below '
+            f'{self.moving_speed:.2g} m/s'
+        )
+
+    @property
+    def noise_remedy(self) -> str:
+        """Words about noise that hides much of the motion, which is more than noise; or none."""
+        speed = float(np.sqrt(np.mean(self.undelayed[0] ** 2)))
+        if not _SIGNAL * self.velocity_noise < speed < _HIDES * self.velocity_noise:
+            return ''
+        return f'; {self.noise_words}: choose a lower cutoff'
 
 
 def filter_signals(

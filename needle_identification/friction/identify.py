@@ -192,12 +192,7 @@ def _noise_remark(chosen: _Candidate) -> str:
     if bias := checks.noise_bias(design, chosen.fit):
         return checks.noise_words(design, bias)
     signals, usual = design.signals, float(np.median(np.abs(design.velocity[design.used])))
-    if signals.moving_speed < _HIDDEN * usual:
-        return ''
-    return (
-        f'noise of {signals.velocity_noise:.2g} m/s in the speed hides motion below '
-        f'{signals.moving_speed:.2g} m/s'
-    )
+    return '' if signals.moving_speed < _HIDDEN * usual else signals.noise_words
 
 
 def _with_low_pass(recording: Recording, chosen: _Candidate) -> _Candidate | None:

@@ -370,6 +370,22 @@ def test_noise_of_the_positions_is_no_friction_near_rest(
         assert advised(found) == terms
 
 
+@pytest.mark.parametrize('noise', [2e-5, 4e-5])
+def test_a_lower_cutoff_is_the_remedy_for_motion_hidden_by_noise(noise: float) -> None:
+    kind = NoiseKind(positions_only=True, position_noise=noise)
+    for seed in range(4):
+        recording, truth = recorded(kind, np.random.default_rng(seed))
+        with pytest.raises(IdentificationError, match='choose a lower cutoff'):
+            identify_friction(recording)
+        found = identify_friction(recording, FrictionSettings(cutoff=5.0))
+        for name, value in truth.items():
+            assert abs(found[name].value - value) < 4.0 * found[name].error
+        # Noise without motion: another topic is the remedy.
+        still = replace(recording, depth=noise * np.random.default_rng(seed).normal(size=10000))
+        with pytest.raises(IdentificationError, match=r'axis or topic$'):
+            identify_friction(still)
+
+
 def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
     recording, truth = recorded(NoiseKind(speed_noise=1e-3), np.random.default_rng(3))
     found = identify_friction(recording)
