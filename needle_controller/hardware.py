@@ -283,7 +283,7 @@ class Robot:
     def command(
         self,
         answer: ForceCommand,
-        depth: float | None,
+        depth: float | None = None,
         load: float = 0.0,
         *,
         stopped: bool = False,

@@ -382,7 +382,7 @@ def test_a_lower_cutoff_is_the_remedy_for_motion_hidden_by_noise(noise: float) -
             assert abs(found[name].value - value) < 4.0 * found[name].error
         # Noise without motion: another topic is the remedy.
         still = replace(recording, depth=noise * np.random.default_rng(seed).normal(size=10000))
-        with pytest.raises(IdentificationError, match=r'axis or topic$'):
+        with pytest.raises(IdentificationError, match=r'axis, topic or column$'):
             identify_friction(still)
 
 

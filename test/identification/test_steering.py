@@ -513,9 +513,9 @@ def test_a_bag_of_the_plant_is_read_without_options(
 def test_a_parameter_file_has_one_medium(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ('gel', 'liver'):
+    for seed, name in enumerate(('gel', 'liver')):
         (tmp_path / name).mkdir()
-        write_table(tmp_path / name / 'run.csv', insertion(1, replace(PLAIN, noise=1e-5)))
+        write_table(tmp_path / name / 'run.csv', insertion(seed, replace(PLAIN, noise=1e-5)))
     tables = [str(tmp_path / name / 'run.csv') for name in ('gel', 'liver')]
     words = ['identify', 'steering', *tables, '--columns', COLUMNS, '--terms', 'tilt']
     assert main([*words, '-o', str(tmp_path / 'both.yaml')]) == 2
