@@ -107,6 +107,9 @@ class Admittance:
         """
         self.velocity, self.answered = 0.0, None
         self._states.clear()
+        if measured is None:
+            # The robot comes to its command meanwhile, or is elsewhere afterwards.
+            self._ahead = 0.0
         if self.position is None or measured is None:
             return None
         self.position = self._rest(measured)

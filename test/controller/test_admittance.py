@@ -151,6 +151,18 @@ def test_base_at_rest_moves_no_needle_that_was_moved(
     assert abs(base.step(0.0, measured, 10**12) - command) < 1e-12
 
 
+@pytest.mark.requirement('S-326')
+def test_base_without_measurements_has_no_lead_afterwards() -> None:
+    """A robot that has not come to its command has been stopped, or is another."""
+    base = base_of(lead=LEAD)
+    for k in range(50):
+        base.step(10.0, 0.02, k * STEP)
+    assert base.position == pytest.approx(0.021)
+    assert base.hold(None) is None
+    assert base.state(0.02).depth == 0.02
+    assert base.hold(0.02) == 0.02
+
+
 def test_noise_does_not_move_a_base_at_rest() -> None:
     """Noise of the encoders is less than the distance of a needle that was moved."""
     base = base_of(lead=LEAD)
