@@ -116,9 +116,9 @@ class Admittance:
         self._ahead = min(self._ahead, max(self.position - measured, 0.0))
         return self.position
 
-    def give_way(self, measured: float | None) -> float | None:
+    def give_way(self, measured: float) -> float | None:
         """Stop the base where it no longer pushes; see `hold`."""
-        if self.position is not None and measured is not None and not self._yields:
+        if self.position is not None and not self._yields:
             # Of a withdrawing needle the measured depth is the deeper one.
             self.position, self._yields = min(measured, self.position), True
         return self.hold(measured)

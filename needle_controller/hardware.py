@@ -303,12 +303,12 @@ class Robot:
         base, length = self._base, None
         if base is not None:
             # Without a reference no motion is requested, except for a repeated message.
-            if stopped:
-                length = base.give_way(depth)
-            elif depth is None:
+            if depth is None:
                 # The other joints may be elsewhere, too.
                 self._others.clear()
                 length = base.hold(None)
+            elif stopped:
+                length = base.give_way(depth)
             elif answer.reference and self.probe is not None:
                 if isfinite(self.probe):
                     base.place(self.probe)

@@ -226,6 +226,18 @@ def test_other_joints_hold_their_position() -> None:
     assert robot.command(push(SECOND, 0.0), 0.03) == [2.0, 0.03]
 
 
+@pytest.mark.requirement('S-326')
+def test_other_joints_hold_where_they_are_after_a_loss() -> None:
+    """Also in a stop: a robot that has restarted may have moved all joints."""
+    for stopped in (False, True):
+        robot = moves(joint='slide', command_joints=('a', 'slide'))
+        robot.measurement(state(['slide', 'a'], [0.02, 1.0], [0.0, 0.0]))
+        assert robot.command(push(SECOND, 0.0), 0.02) == [1.0, 0.02]
+        assert robot.command(ForceCommand(SECOND + 1), None, stopped=stopped) is None
+        robot.measurement(state(['slide', 'a'], [0.03, 2.0], [0.0, 0.0]))
+        assert robot.command(ForceCommand(SECOND + 2), 0.03, stopped=stopped) == [2.0, 0.03]
+
+
 @pytest.mark.requirement('S-114')
 def test_position_command_rests_without_a_reference() -> None:
     """It holds the last command in a fault, and yields to the robot in a stop.
