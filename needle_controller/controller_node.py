@@ -316,8 +316,9 @@ class ControllerNode(ModelNode):
 
         def on_reading(reading: Reading) -> None:
             # Events without a command wait for the next command, or for `_check_inputs`.
-            if (answer := take(reading, self.now())) is not None:
-                self._act(answer)
+            now = self.now()
+            if (answer := take(reading, now)) is not None:
+                self._act(answer, now)
             then()
 
         return on_reading

@@ -201,10 +201,11 @@ class PlantNode(ModelNode):
 
     def change(self, changes: Mapping[str, Any]) -> None:
         """Apply changed friction or fault parameters; the state is kept."""
-        fault = self._fault(changes)
+        # Each is checked before any acts.
+        fault = self._fault(changes) if any(one.startswith('fault.') for one in changes) else None
         if self._run is not None:
             self._run.perform(Event(PARAMETERS, changes))
-        if any(name.startswith('fault.') for name in changes):
+        if fault is not None:
             self._samples.fault, self._samples.faulty = fault
 
     def _fault(self, changes: Mapping[str, Any]) -> tuple[SensorFault | None, str]:

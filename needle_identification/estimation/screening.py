@@ -44,22 +44,24 @@ class Screening:
         regressors: FloatArray,
         response: FloatArray,
         parts: Parts,
-        noise: FloatArray | float = 0.0,
+        noise: FloatArray | None = None,
     ) -> None:
         norms = _norms(regressors)
         self._x = regressors / norms
-        self._noise = np.broadcast_to(noise / norms, self._x.shape)
         self._gram = self._x.T @ self._x
         self._moment = self._x.T @ response
         self._power = float(response @ response)
         self._inverse = np.linalg.pinv(self._gram, hermitian=True)
         values = self._inverse @ self._moment
         self._residual = response - self._x @ values
-        self._blur = self._noise @ values
+        scaled = np.zeros_like(self._x) if noise is None else noise / norms
+        #: Change of the residual by the noise, and its product with that of each column.
+        self._blur = scaled @ values
+        self._pull = scaled.T @ self._blur
         self._starts = np.concatenate([[0], np.cumsum(parts.sizes)[:-1]]).astype(np.int_)
         self.misfit = float(self._residual @ self._residual)
 
-    def tried(self, columns: FloatArray, noise: FloatArray | float = 0.0) -> Trial:
+    def tried(self, columns: FloatArray, noise: FloatArray | None = None) -> Trial:
         """
         Fit with additional columns (n, q) of the used samples.
 
@@ -71,10 +73,12 @@ class Screening:
         k, q = len(self._gram), z.shape[1]
         both = self._x.T @ z
         part = self._inverse @ both
-        rest, blur = z - self._x @ part, noise / norms - self._noise @ part
+        rest, pull = z - self._x @ part, -part.T @ self._pull
+        if noise is not None:
+            pull += noise.T @ self._blur / norms
         inner = np.linalg.pinv(rest.T @ rest, hermitian=True)
         # A shared noise e changes z and y - X b: E[z(v + e) e] = var(e) E[z'(v + e)] (Stein).
-        values = inner @ (rest.T @ self._residual + blur.T @ self._blur)
+        values = inner @ (rest.T @ self._residual + pull)
         left = self._residual - rest @ values
         scores = self._scores(rest, left)
         free = len(self._starts) - k - q

@@ -96,7 +96,7 @@ def _of_zero(design: Design) -> Iterator[str]:
     terms = design.signals.settings.terms
     if 'coulomb' not in terms or 'offset' in terms:
         return
-    if not design.screening().tried(design.columns(['offset'])[design.used]).determined:
+    if not design.screening.tried(design.columns(['offset'])[design.used]).determined:
         cure = '' if 'direction' in terms else ', or record both directions'
         yield f'mu_s includes the zero of the force sensor: tare it before contact{cure}'
 

@@ -40,10 +40,11 @@ class CandidateFit:
 
 def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[CandidateFit, ...]:
     """Add each unused term, leave out each chosen term; among: number of recordings."""
-    chosen = design.signals.settings.terms
+    chosen, screening = design.signals.settings.terms, design.screening
+    samples = _independent_samples(design, fit)
     if 'decay' not in chosen:
         design = _with_decay_time(design, fit.residual)
-    comparison = _Comparison(design, fit, design.screening(), SIGNIFICANCE / among)
+    comparison = _Comparison(design, fit, screening, samples, SIGNIFICANCE / among)
     singles = [(term,) for term in _candidates(design)]
     found = comparison.added(singles)
     growth = 1.0 if fit.memory is None else float(fit.memory.inflation.max())
@@ -86,11 +87,12 @@ def _candidates(design: Design) -> list[str]:
 
 
 class _Comparison(NamedTuple):
-    """A fit, its screening, and the level of the tests."""
+    """A fit, its screening, its number of independent samples, and the level of the tests."""
 
     design: Design
     fit: Regression
     screening: Screening
+    samples: float
     level: float
 
     def added(self, candidates: Sequence[tuple[str, ...]]) -> list[CandidateFit]:
@@ -100,7 +102,7 @@ class _Comparison(NamedTuple):
         p_values = _holm(np.multiply([trial.p_value for trial in tried], searched).tolist())
         # The residual without a missing term is no noise: samples of the best fit.
         known = [(trial.misfit, trial.samples) for trial in tried if trial.samples]
-        samples = min(known)[1] if known else _independent_samples(self.design, self.fit)
+        samples = min(known)[1] if known else self.samples
         found = zip(candidates, tried, p_values, strict=True)
         return _simplest([self._judged(*one, samples) for one in found])
 
@@ -172,8 +174,7 @@ class _Comparison(NamedTuple):
             return CandidateFit(terms=terms, words=words)
         p_value = wald_test(fit, which)
         misfit = self.screening.misfit_without(which) / self.screening.misfit
-        samples = _independent_samples(self.design, fit)
-        difference = samples * log(misfit) - len(which) * log(samples)
+        difference = self.samples * log(misfit) - len(which) * log(self.samples)
         supported = p_value >= SIGNIFICANCE and difference < 0.0
         words = f'the data {"do not need" if supported else "need"} {term} (p = {p_value:.2g})'
         return CandidateFit(

@@ -69,6 +69,7 @@ class Design:
         """Parts of the used samples with the correlation length of the noise."""
         return divided(self.used, self.signals.correlation)
 
+    @cached_property
     def screening(self) -> Screening:
         """Return the least squares fit of the chosen terms, for additional terms on trial."""
         terms = self.signals.settings.terms
@@ -143,14 +144,14 @@ class Design:
         """Return the p-value of a delayed sign of friction, and of breakaway, at reversals."""
         sign = self.signals.sign
         columns = np.column_stack([np.gradient(sign), sign * (1.0 - sign**2)])
-        return self.screening().tried(columns[self.used]).p_value
+        return self.screening.tried(columns[self.used]).p_value
 
     def lag_spread(self) -> Trial:
         """Return the variance [s^2] of the lag that the fit lacks."""
         time, used = self.signals.time, self.used
         bend = self.signals.motion(np.clip(time - self.lag, time[0], time[-1]), 2)[used]
         bend *= np.linalg.norm(self.lag_column[used]) / np.linalg.norm(self.acceleration[used])
-        return self.screening().tried(0.5 * bend[:, np.newaxis])
+        return self.screening.tried(0.5 * bend[:, np.newaxis])
 
     def with_lag_column(self) -> Design:
         """Add the derivative of the fitted force by the lag as a regressor."""

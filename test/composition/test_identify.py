@@ -340,7 +340,8 @@ def test_rotated_axes_of_the_force_are_named(
     out, _ = identify(capsys, 'stiffness', path)
     (told,) = re.findall(r'^place, 1\.10 N: not a spring unless .* rotation of (\S+) ', out, re.M)
     # Without the rotation the presses have a curl of -20 N/m in 2270 N/m, -0.5 degrees.
-    assert float(told) == pytest.approx(np.degrees(angle - 20.0 / 2270.0), abs=0.2)
+    # Twice its printed error.
+    assert float(told) == pytest.approx(np.degrees(angle - 20.0 / 2270.0), abs=0.04)
     (one,) = as_json(capsys, 'stiffness', path)['estimates']
     assert all('not a spring unless' in level['words'] for level in one['levels'])
 

@@ -80,6 +80,7 @@ def test_position_commands_invert_measurements(robot: Robot, position: float) ->
                                   zero=settings.zero))  # fmt: skip
     sent.configure(Controller(NeedleParameters.preset('phantom')))
     sent.measurement(state(['insertion'], [position], [0.0]))
+    # Rounded as above.
     assert sent.command(push(SECOND, 0.0), length) == pytest.approx([position], abs=1e-9)
 
 

@@ -101,6 +101,7 @@ def test_the_needle_axis_is_chosen_among_components(tmp_path: Path) -> None:
     assert 'depth=z [mm],force=fz' in inspect_recording(path).command
     given = read_friction_recording(path, columns={'force': 'fy'})
     assert 'depth=z [mm]' in given.losses[0]
+    # Nine digits are written, of forces of a few newtons.
     assert given.force == pytest.approx(columns[4], abs=1e-8)
     columns[5] = rng.normal(size=len(made.time))
     columns[3:5] = columns[5], columns[5]
