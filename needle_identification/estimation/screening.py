@@ -112,5 +112,5 @@ class Screening:
 
 
 def _norms(columns: FloatArray) -> FloatArray:
-    norms = np.linalg.norm(columns, axis=0)
+    norms = np.sqrt(np.einsum('ij,ij->j', columns, columns))
     return np.where(norms > 0.0, norms, 1.0)

@@ -109,8 +109,8 @@ class _Comparison(NamedTuple):
     def _tried(self, more: tuple[str, ...]) -> Trial:
         """Fit additional terms, with errors for autocorrelated noise if they are significant."""
         design, settings = self.design, self.design.signals.settings
-        used = design.used
-        trial = self.screening.tried(design.columns(more)[used], design.column_noise(more)[used])
+        columns = design.columns(more).take(design.rows, axis=0)
+        trial = self.screening.tried(columns, design.column_noise(more))
         if not trial.determined or trial.p_value >= SIGNIFICANCE:
             return trial
         which = list(range(design.terms, design.terms + len(trial.values)))

@@ -21,6 +21,7 @@ from needle_identification.estimation.memory import divided, Parts, stretches
 from needle_identification.estimation.regression import independent_span, regress, Regression
 from needle_identification.estimation.screening import Screening, Trial
 from needle_identification.friction.filtering import FilteredSignals, HALF_LENGTH
+from needle_identification.friction.settings import OF_VELOCITY
 from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 import numpy as np
 from scipy.fft import next_fast_len
@@ -70,13 +71,18 @@ class Design:
         return divided(self.used, self.signals.correlation)
 
     @cached_property
+    def rows(self) -> IntArray:
+        """Indices of the used samples."""
+        return np.flatnonzero(self.used)
+
+    @cached_property
     def screening(self) -> Screening:
         """Return the least squares fit of the chosen terms, for additional terms on trial."""
-        terms = self.signals.settings.terms
-        x, noise = self.regressors(terms), self.column_noise(terms)
-        noise = np.column_stack([noise, np.zeros_like(self.lag_column)])
-        used = self.used
-        return Screening(x[used], self.signals.force[used], self.parts, noise[used])
+        terms, rows = self.signals.settings.terms, self.rows
+        x, noise = self.regressors(terms).take(rows, axis=0), self.column_noise(terms)
+        if noise is not None:
+            noise = np.pad(noise, ((0, 0), (0, self.lag_column.shape[1])))
+        return Screening(x, self.signals.force[rows], self.parts, noise)
 
     def regressors(self, terms: Sequence[str]) -> FloatArray:
         """Return the regressors of terms and of an estimated lag, shape (n, k)."""
@@ -99,11 +105,14 @@ class Design:
         motion = NeedleMotion(velocity, self.acceleration, time, depth, self.fresh, sign)
         return regressors(motion, terms, signals.settings)
 
-    def column_noise(self, terms: Sequence[str]) -> FloatArray:
-        """Return the change of terms by a standard deviation of the velocity noise, (n, k)."""
+    def column_noise(self, terms: Sequence[str]) -> FloatArray | None:
+        """Return the change of terms by a standard deviation of the velocity noise, if any."""
         noise = self.signals.velocity_noise
+        if noise == 0.0 or OF_VELOCITY.isdisjoint(terms):
+            return None
         less, more = (replace(self, velocity=self.velocity + e) for e in (-noise, noise))
-        return 0.5 * (more.columns(terms) - less.columns(terms))
+        change = more.columns(terms) - less.columns(terms)
+        return np.asarray(0.5 * change.take(self.rows, axis=0))
 
     def reaches(self, term: str) -> bool:
         """Test whether enough samples lie where a term has an effect."""

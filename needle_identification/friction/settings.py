@@ -18,6 +18,9 @@ TERMS: Final = (
 #: Terms that remain linear within the filter window of a reversal.
 LINEAR: Final = frozenset(TERMS) - {'direction', 'stribeck', 'cutting'}
 
+#: Terms whose columns change with the velocity; the others depend on its sign at most.
+OF_VELOCITY: Final = frozenset({'viscous', 'direction', 'stribeck'})
+
 AUTO: Final = 'auto'  #: automatic choice of the estimator
 
 

@@ -22,6 +22,8 @@ from needle_identification import (
 )
 from needle_identification.friction.filtering import cut_off, low_pass_taps
 from needle_identification.friction.lag import velocity_delay, velocity_scale
+from needle_identification.friction.settings import OF_VELOCITY, TERMS
+from needle_identification.friction.terms import NeedleMotion, regressors
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
@@ -447,3 +449,18 @@ def test_two_terms_are_advised_only_if_each_is_needed(number: int) -> None:
     name = 'outliers of one sign'
     recording, _ = recorded(FURTHER[name].kind, np.random.default_rng([2014, number, 21]))
     assert set(advised(identify_friction(recording))) <= {'offset'}
+
+
+@pytest.mark.parametrize('term', TERMS)
+def test_noise_of_the_velocity_changes_the_columns_of_its_terms_alone(term: str) -> None:
+    speed = np.array([-4e-4, -1e-5, 2e-5, 3e-4])
+    depth, settings = np.cumsum(speed), FrictionSettings(terms=('layers',), layers=(0.0,))
+    columns = [
+        regressors(
+            NeedleMotion(v, 0.0 * v, np.arange(4.0), depth, depth >= 0.0, np.sign(v)),
+            [term],
+            settings,
+        )
+        for v in (speed, 1.1 * speed)
+    ]
+    assert (columns[0] != columns[1]).any() == (term in OF_VELOCITY)
