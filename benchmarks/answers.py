@@ -25,7 +25,7 @@ from needle_insertion.report.content import table
 from needle_ros import contract
 from needle_ros.base_node import COMMAND
 from needle_ros.requests import Verdict
-from needle_ros.status import ControllerPhase, ControllerStatus, node_of
+from needle_ros.status import ControllerPhase, ControllerStatus, read_reports
 from needle_ros.timing import nanoseconds
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -68,10 +68,8 @@ def measure(count: int, seed: int, rate: float, logs: Path) -> dict[Verdict, lis
         active: list[bool] = []
 
         def hear(array: DiagnosticArray) -> None:
-            for status in array.status:
-                if node_of(status.name) == '/controller':
-                    values = {one.key: one.value for one in status.values}
-                    found = ControllerStatus.from_values(values)
+            for report in read_reports(array):
+                if isinstance(found := report.status, ControllerStatus):
                     active.append(found.phase is ControllerPhase.ACTIVE)
                     for answer in found.requests.answers:
                         heard.setdefault(answer.stamp, (monotonic(), answer.verdict))

@@ -179,7 +179,7 @@ class Insertions:
 
     def status(self, name: str, kind: type[_Status]) -> _Status:
         """Return the latest status of a node."""
-        found = self._operator.states[name].status
+        found = self._operator.states[name].report.status
         if not isinstance(found, kind):
             raise GraphError(f'{name} reports {found}')
         return found

@@ -125,7 +125,7 @@ class InterruptedInsertion:
 
     def _status(self) -> SteeringStatus | None:
         found = self._operator.states.get('steering')
-        status: NodeStatus | None = None if found is None else found.status
+        status: NodeStatus | None = None if found is None else found.report.status
         return status if isinstance(status, SteeringStatus) else None
 
     def _is_ready(self) -> bool:

@@ -17,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
 from needle_insertion.graph.ros_graph import Graph, GraphError, NodeProcess
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.status import ControllerStatus, node_of, NodeStatus, read_status
+from needle_ros.status import ControllerStatus, NodeReport, NodeStatus, read_reports
 from sensor_msgs.msg import JointState
 
 #: Publishes force commands repeatedly: for 6 to 48 ms, or for the first 80 ms after its start.
@@ -112,7 +112,7 @@ class Bystander:
         self._graph, self.depths = graph, list[float]()
         self._health: list[DiagnosticArray] = []
         #: Statuses of the messages parsed so far, and number of these messages.
-        self._reports: list[NodeStatus] = []
+        self._reports: list[NodeReport] = []
         self._parsed = 0
         probe = graph.node('bystander')
         probe.create_subscription(JointState, 'ground_truth', self._on_truth, SENSOR)
@@ -177,32 +177,28 @@ class Bystander:
         return max(self.depths) - min(self.depths)
 
     @property
-    def _statuses(self) -> list[NodeStatus]:
+    def _heard(self) -> list[NodeReport]:
         # Each message is parsed once: conditions are evaluated at every message of any topic.
         new = self._health[self._parsed :]
         self._parsed += len(new)
-        values = (
-            {one.key: one.value for one in part.values} for one in new for part in one.status
-        )
-        self._reports += [one for one in map(read_status, values) if one is not None]
+        self._reports += [one for array in new for one in read_reports(array)]
         return self._reports
 
     def reported(self, condition: Callable[[NodeStatus], bool]) -> bool:
         """Return whether any status met a condition."""
-        return any(map(condition, self._statuses))
+        return any(one.status is not None and condition(one.status) for one in self._heard)
 
     @property
     def _complaints(self) -> str:
         """Last message of each node."""
-        last = {
-            node_of(status.name): status.message for one in self._health for status in one.status
-        }
+        last = {one.node: one.message for one in self._heard}
         return '; '.join(f'{name}: {message!r}' for name, message in last.items())
 
     @property
     def stops(self) -> set[int]:
         """Number of latched stops reported by the controllers."""
-        return {one.stops for one in self._statuses if isinstance(one, ControllerStatus)}
+        found = [one.status for one in self._heard]
+        return {one.stops for one in found if isinstance(one, ControllerStatus)}
 
 
 def measure(tick: Tick, tries: int = 10) -> tuple[list[tuple[str, ...]], list[Bar]]:

@@ -27,7 +27,7 @@ from benchmarks.pairs import cpu_seconds
 from diagnostic_msgs.msg import DiagnosticArray
 from needle_insertion.graph.ros_graph import Graph
 from needle_ros.errors import JobError
-from needle_ros.status import PlantStatus, read_status
+from needle_ros.status import PlantStatus, read_reports
 import numpy as np
 from rclpy.node import Node
 
@@ -95,10 +95,8 @@ def measure() -> dict[str, list[float]]:
         factors: list[float] = []
 
         def hear(array: DiagnosticArray) -> None:
-            for status in array.status:
-                found = read_status({pair.key: pair.value for pair in status.values})
-                if isinstance(found, PlantStatus):
-                    factors.append(found.real_time_factor)
+            found = [one.status for one in read_reports(array)]
+            factors.extend(one.real_time_factor for one in found if isinstance(one, PlantStatus))
 
         node.create_subscription(DiagnosticArray, '/diagnostics', hear, 10)
         pids = {

@@ -24,14 +24,14 @@ from needle_dynamics.simulated.assembly import defaults_of
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros import contract
 from needle_ros.base_node import steady_timer
-from needle_ros.errors import MessageError, ParameterError, printable
+from needle_ros.errors import MessageError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.life_cycle_node import imports, PreparationProgress
 from needle_ros.publishers_node import Publishers
 from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.run_node import run
 from needle_ros.settings import from_values
-from needle_ros.status import Diagnosis, node_of, SteeringStatus
+from needle_ros.status import Diagnosis, read_reports, SteeringStatus
 from needle_ros.system_state import Authority
 from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import NANOSECONDS, nanoseconds, set_time
@@ -265,11 +265,9 @@ class SteeringNode(CompiledNode):
         if self._client is not None:
             # The action answers; receivers of the topic take none of the motions.
             return
-        for status in message.status:
-            answers = RequestStatus.from_values({one.key: one.value for one in status.values})
-            if answers.takes:
-                node = printable(node_of(status.name).rpartition('/')[2])
-                self._take_answers(node, answers)
+        for report in read_reports(message):
+            if report.requests.takes:
+                self._take_answers(report.name, report.requests)
 
     def _take_answers(self, receiver: str, answers: RequestStatus) -> None:
         if self._loop is not None and self.is_active:

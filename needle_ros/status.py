@@ -11,27 +11,24 @@ a value has no pair.
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
-from functools import cache
+from functools import cache, cached_property
 from types import NoneType, UnionType
 from typing import Any, Final, Generic, get_args, get_origin, get_type_hints, TypeVar
 
+from needle_ros.errors import printable, shown
 from needle_ros.event_log import Severity
 from needle_ros.requests import RequestStatus
 from needle_ros.system_state import Mode
 
 TASK: Final = 'state'  #: Task in the name of the status of a node: ``/plant: state``.
 HARDWARE: Final = 'needle'  #: Hardware of nodes without a namespace; else the namespace.
+LEVELS: Final = ('OK', 'WARN', 'ERROR', 'STALE')  #: Names of the levels of a DiagnosticStatus.
 STALE: Final = bytes([3])  #: Level STALE of a DiagnosticStatus: its values are no longer updated.
 _KIND: Final = 'kind'  #: Key of the kind of a status.
 _MISSING: Final = object()  #: Result of a field that is missing or invalid in a status.
 
 _Status = TypeVar('_Status', bound='NodeStatus')
 _Reported_co = TypeVar('_Reported_co', bound='NodeStatus', covariant=True)
-
-
-def node_of(name: str) -> str:
-    """Return the node in the name of a DiagnosticStatus; nodes of others keep their tasks."""
-    return name.removesuffix(f': {TASK}')
 
 
 def entry(default: Any, unit: str, description: str) -> Any:
@@ -323,10 +320,47 @@ class Diagnosis(Generic[_Reported_co]):
     status: _Reported_co
 
 
-def read_status(values: Mapping[str, str]) -> NodeStatus | None:
-    """Parse the status of a node from key-value pairs; None if it is not of this suite."""
-    kind = STATUSES.get(values.get(_KIND, ''))
-    return None if kind is None else kind.from_values(values)
+@dataclass(frozen=True)
+class NodeReport:
+    """State of a node as received on /diagnostics, of this suite or of others."""
+
+    node: str  #: Node with its namespace; nodes of others keep their tasks.
+    level: int  #: Index of `LEVELS`, or larger.
+    message: str
+    values: Mapping[str, str]
+
+    @property
+    def name(self) -> str:
+        """Name of the node without its namespace."""
+        return self.node.rpartition('/')[2]
+
+    @property
+    def level_name(self) -> str:
+        return LEVELS[self.level] if self.level < len(LEVELS) else str(self.level)
+
+    @cached_property
+    def status(self) -> NodeStatus | None:
+        """Typed status of a node of this suite."""
+        kind = STATUSES.get(self.values.get(_KIND, ''))
+        return None if kind is None else kind.from_values(self.values)
+
+    @cached_property
+    def requests(self) -> RequestStatus:
+        """Requests that the node accepts, and its answers."""
+        return RequestStatus.from_values(self.values)
+
+
+def read_reports(message: Any) -> list[NodeReport]:
+    """Read the states of nodes from a DiagnosticArray of rclpy or of a bag."""
+    return [_report(status) for status in message.status]
+
+
+def _report(status: Any) -> NodeReport:
+    # rclpy represents a byte as bytes.
+    level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+    values = {shown(one.key): shown(one.value) for one in status.values}
+    node = printable(status.name).removesuffix(f': {TASK}')
+    return NodeReport(node, level, printable(status.message), values)
 
 
 # Mapping to and from key-value pairs.

@@ -12,7 +12,7 @@ import xml.etree.ElementTree as ET
 
 from diagnostic_msgs.msg import DiagnosticArray
 from needle_insertion.graph.ros_graph import Graph
-from needle_ros.status import node_of, RecorderStatus
+from needle_ros.status import read_reports, RecorderStatus
 import pytest
 from rosbags.highlevel import AnyReader
 import yaml
@@ -98,11 +98,10 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     heard: list[str] = []
 
     def hear(message: DiagnosticArray) -> None:
-        for status in message.status:
-            heard.append(node_of(status.name))
-            if heard[-1] == '/recorder':
-                values = {item.key: item.value for item in status.values}
-                counts.update(RecorderStatus.from_values(values).recorded)
+        for report in read_reports(message):
+            heard.append(report.node)
+            if isinstance(report.status, RecorderStatus):
+                counts.update(report.status.recorded)
 
     with Graph(folder / 'logs') as graph:
         probe = graph.node('probe')

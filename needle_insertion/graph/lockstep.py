@@ -121,7 +121,7 @@ def activate_plant(
     """Activate the plant when `ready`, and the plant has discovered the nodes in lock-step."""
 
     def found() -> bool:
-        status = states['plant'].status if 'plant' in states else None
+        status = states['plant'].report.status if 'plant' in states else None
         in_lockstep = isinstance(status, PlantStatus) and status.lockstep_nodes == number
         return in_lockstep and ready()
 

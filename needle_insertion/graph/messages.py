@@ -10,21 +10,15 @@ from geometry_msgs.msg import PointStamped
 from needle_ros import contract
 from needle_ros.base_node import message_class, profile
 from needle_ros.contract import Qos, Topic
-from needle_ros.errors import printable
-from needle_ros.requests import RequestStatus
-from needle_ros.status import node_of, NodeStatus, read_status
+from needle_ros.status import NodeReport, read_reports
 from needle_ros.timing import set_time
 from rclpy.node import Node
 
 
 class State(NamedTuple):
-    """Latest status of a node on /diagnostics."""
+    """Latest report of a node on /diagnostics."""
 
-    #: 0 OK, 1 warning, 2 error.
-    level: int
-    message: str
-    status: NodeStatus | None  #: Typed status of a node of the suite.
-    requests: RequestStatus  #: Requests that the node accepts, and its answers.
+    report: NodeReport
     received: float  #: Time of receipt by `time.monotonic` [s].
 
     @property
@@ -34,24 +28,15 @@ class State(NamedTuple):
 
 
 def listen_states(
-    node: Node, on_state: Callable[[str, State], object] = lambda _name, _state: None
+    node: Node, on_state: Callable[[NodeReport], object] = lambda _: None
 ) -> dict[str, State]:
     """Subscribe to /diagnostics; return the latest state of each node, by its bare name."""
     states: dict[str, State] = {}
 
     def on_array(array: DiagnosticArray) -> None:
-        for status in array.status:
-            name = printable(node_of(status.name).rpartition('/')[2])
-            values = {printable(one.key): printable(one.value) for one in status.values}
-            states[name] = State(
-                # rclpy represents a byte as bytes.
-                int.from_bytes(status.level, 'little'),
-                printable(status.message),
-                read_status(values),
-                RequestStatus.from_values(values),
-                monotonic(),
-            )
-            on_state(name, states[name])
+        for report in read_reports(array):
+            states[report.name] = State(report, monotonic())
+            on_state(report)
 
     topic = contract.DIAGNOSTICS
     node.create_subscription(DiagnosticArray, topic.name, on_array, profile(topic.qos))

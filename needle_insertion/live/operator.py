@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from geometry_msgs.msg import PointStamped
-from needle_insertion.graph.messages import listen_states, State, target_message
+from needle_insertion.graph.messages import listen_states, target_message
 from needle_insertion.live.requests import CONTROLLER, NODES, ONCE, REQUESTS, STEERING
 from needle_ros import contract
 from needle_ros.base_node import profile, steady_timer
@@ -13,6 +13,7 @@ from needle_ros.calls_node import Calls
 from needle_ros.errors import printable
 from needle_ros.publishers_node import request_stamp
 from needle_ros.requests import no_answer, PendingRequest
+from needle_ros.status import NodeReport
 from needle_ros.timing import nanoseconds
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
@@ -62,9 +63,9 @@ class Operator:
             self._clients[node, service] = client
         return self._clients[node, service]
 
-    def _on_state(self, name: str, state: State) -> None:
+    def _on_state(self, report: NodeReport) -> None:
         for pending, _ in self._sending:
-            pending.take_status(name, state.requests)
+            pending.take_status(report.name, report.requests)
 
     def _repeat(self) -> None:
         """Repeat targets without an answer; use simulated time if it is published."""

@@ -114,7 +114,7 @@ class Session:
         begin = monotonic()
 
         def show(name: str) -> None:
-            message = f': {states[name].message}' if name in states else ''
+            message = f': {states[name].report.message}' if name in states else ''
             line = f'starting {name}, {monotonic() - begin:.0f} s{message}'
             self.screen.show(line.removesuffix(': '))
 

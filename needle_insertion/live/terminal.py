@@ -27,6 +27,7 @@ from needle_ros.quantities import quantity, target, TARGET_HELP
 from needle_ros.status import (
     CommissioningPhase,
     ControllerStatus,
+    LEVELS,
     RecorderStatus,
     SteeringPhase,
     SteeringStatus,
@@ -55,8 +56,7 @@ _NEEDED: Final = (
 _PATIENCE: Final = 0.3  #: Time after which the next line can be typed during a command [s].
 _AGAIN: Final = 30.0  #: Shortest time between two prints of the same warning [s].
 
-_LEVELS: Final = ('OK', 'WARN', 'ERROR', 'STALE')
-_ERROR: Final = _LEVELS.index('ERROR')
+_ERROR: Final = LEVELS.index('ERROR')
 
 #: Phases in which no insertion is under way.
 _AT_REST: Final = (SteeringPhase.IDLE, SteeringPhase.DONE, SteeringPhase.STOPPED)
@@ -98,14 +98,15 @@ class Warnings:
     def show(self, states: Mapping[str, State]) -> None:
         now = monotonic()
         for name, state in states.items() if now >= self.quiet else ():
-            level, message = state.level, state.message
+            report = state.report
+            level, words = report.level, f'{report.level_name} {report.message}'
             if state.age > _SILENT:
-                level, message = _ERROR, f'no status for {_SILENT:g} s'
+                level, words = _ERROR, f'ERROR no status for {_SILENT:g} s'
             # A changed number is not a new warning.
-            kind = re.sub(r'\d+', '', message)
+            kind = re.sub(r'\d+', '', words)
             again = level >= _ERROR or now - self._printed.get((name, kind), -inf) > _AGAIN
             if level and kind != self._last.get(name) and again:
-                self._say(f'{name}: {_LEVELS[min(level, 3)]} {message}')
+                self._say(f'{name}: {words}')
                 self._printed[name, kind] = now
             self._last[name] = kind
 
@@ -144,7 +145,7 @@ class Terminal(Cmd):
         self._warnings.quiet = 0.0
 
     def _has_accepted(self, node: str, topic: str) -> bool:
-        status = self._state(node).status
+        status = self._state(node).report.status
         if not isinstance(status, (ControllerStatus, SteeringStatus)):
             return False
         return topic in status.input and status.input[topic].accepted > 0
@@ -154,8 +155,8 @@ class Terminal(Cmd):
         """Whether the needle rests and no steered insertion is under way."""
         insertion = self._readings.insertion()
         still = insertion is not None and abs(insertion[1]) < _REST
-        states = self._operator.states.values()
-        phases = [one.status.phase for one in states if isinstance(one.status, SteeringStatus)]
+        found = [one.report.status for one in self._operator.states.values()]
+        phases = [one.phase for one in found if isinstance(one, SteeringStatus)]
         return still and all(phase in _AT_REST for phase in phases)
 
     def stop(self) -> None:
@@ -222,7 +223,7 @@ class Terminal(Cmd):
         """Print new warnings and errors of the nodes; raise `GraphError` without a recording."""
         self._warnings.show(self._operator.states)
         for name, state in self._operator.states.items():
-            status = state.status
+            status = state.report.status
             if isinstance(status, RecorderStatus) and status.failure:
                 raise GraphError(f'{name}: {status.failure}')
             if isinstance(status, ControllerStatus) and status.commissioning is not self._checked:
@@ -266,10 +267,10 @@ class Terminal(Cmd):
             nonlocal arrived, last, since
             now = self._readings.time
             self._screen.show(self._readings.line())
-            state = self._state(STEERING if self._steers else CONTROLLER)
-            status = state.status
-            if state.level >= _ERROR:
-                raise JobError(state.message)
+            report = self._state(STEERING if self._steers else CONTROLLER).report
+            status = report.status
+            if report.level >= _ERROR:
+                raise JobError(report.message)
             if now - begin > longest:
                 raise JobError(f'target not reached after {longest:g} s: {self._readings.line()}')
             if self._steers:
@@ -295,7 +296,7 @@ class Terminal(Cmd):
         self._await(done, 'the needle', brief=False)
         self._say(self._readings.line())
         if self._steers:
-            self._say(f'{STEERING}: {self._state(STEERING).message}')
+            self._say(f'{STEERING}: {self._state(STEERING).report.message}')
 
     def do_law(self, words: list[str]) -> None:
         if len(words) != 1 or words[0] not in LAWS:
@@ -323,7 +324,7 @@ class Terminal(Cmd):
 
     def do_status(self, _words: list[str]) -> None:
         states = sorted(self._operator.states.items())
-        rows = [(name, _LEVELS[min(one.level, 3)], one.message) for name, one in states]
+        rows = [(name, one.report.level_name, one.report.message) for name, one in states]
         self._say(f'{self._readings.line()}\n{table(rows, ("node", "level", "state"))}')
 
     def _state(self, node: str) -> State:

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import FloatArray
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.settings import check_constants, constant
+from needle_ros.status import NodeReport
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
@@ -29,8 +30,6 @@ _PERIOD: Final = 1.0  #: time between two transmissions, unless something change
 _MOST: Final = 20
 _SILENT: Final = 5.0
 _REMOVED: Final = 60.0
-
-_LEVELS: Final = {0: 'OK', 1: 'WARN', 2: 'ERROR', 3: 'STALE'}
 
 
 def rotation_matrix(quaternion: ArrayLike) -> FloatArray:
@@ -187,18 +186,19 @@ class NodeStates:
     """Latest state of each node on ``/diagnostics``; all times are of a monotonic clock [s]."""
 
     def __init__(self) -> None:
-        #: Time of receipt, level and message, by node.
-        self._states: dict[str, tuple[float, int, str]] = {}
+        #: Time of receipt, name of the level and message, by node.
+        self._states: dict[str, tuple[float, str, str]] = {}
         #: Peer at the last call of `is_due`.
         self._peer = ''
         self._sent = self._changed = -_PERIOD
 
-    def take(self, name: str, level: int, message: str, now: float) -> None:
+    def take(self, report: NodeReport, now: float) -> None:
         """Store the state of a node; further nodes beyond the largest number are ignored."""
+        name, state = report.node.lstrip('/'), (report.level_name, report.message)
         if name in self._states or len(self._states) < _MOST:
-            if self._states.get(name, (0.0, -1, ''))[1:] != (level, message):
+            if self._states.get(name, (0.0, '', ''))[1:] != state:
                 self._changed = now
-            self._states[name] = now, level, message
+            self._states[name] = now, *state
 
     def mark_changed(self, now: float) -> None:
         self._changed = now
@@ -220,5 +220,5 @@ class NodeStates:
         for name, (when, level, message) in self._states.items():
             age = now - when
             silent = f', silent for {age:.0f} s' if age > _SILENT else ''
-            lines.append(f'{name} [{_LEVELS.get(level, str(level))}{silent}]: {message}')
+            lines.append(f'{name} [{level}{silent}]: {message}')
         return lines

@@ -22,13 +22,13 @@ from needle_insertion.slicer.planning import SlicerPlanner, SlicerPlanSettings
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.contract import Topic
-from needle_ros.errors import JobError, MessageError, printable
+from needle_ros.errors import JobError, MessageError
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.life_cycle_node import imports, PreparationProgress
 from needle_ros.publishers_node import request_stamp
-from needle_ros.requests import PendingRequest, RequestStatus
+from needle_ros.requests import PendingRequest
 from needle_ros.run_node import run
-from needle_ros.status import Diagnosis, node_of, SlicerPhase, SlicerStatus
+from needle_ros.status import Diagnosis, read_reports, SlicerPhase, SlicerStatus
 from needle_ros.timing import nanoseconds, RateCounter, set_time
 from needle_ros.wire import Reading
 
@@ -202,12 +202,10 @@ class SlicerNode(BaseNode):
             self._states.mark_changed(monotonic())
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            name, level = node_of(status.name).lstrip('/'), int.from_bytes(status.level, 'little')
-            self._states.take(name, level, printable(status.message), monotonic())
+        for report in read_reports(message):
+            self._states.take(report, monotonic())
             if self._sending is not None:
-                values = {one.key: one.value for one in status.values}
-                self._sending[0].take_status(name, RequestStatus.from_values(values))
+                self._sending[0].take_status(report.name, report.requests)
 
     # Messages of the peer.
 

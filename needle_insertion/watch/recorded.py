@@ -22,7 +22,7 @@ from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.parameter_file import parameters_in
 from needle_ros.settings import is_number
-from needle_ros.status import node_of
+from needle_ros.status import read_reports
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import MessageReader, read_line, read_string
 import numpy as np
@@ -207,9 +207,9 @@ class ShownRecording:
             expected = deserialize(message.topic, data)
             self._keep((name, ''), time, lambda view: view.expected(expected))
         elif name == contract.DIAGNOSTICS.name:
-            for status in deserialize(message.topic, data).status:
-                effect = partial(View.status, status=status, now=time)
-                self._keep((name, node_of(status.name)), time, effect)
+            for report in read_reports(deserialize(message.topic, data)):
+                effect = partial(View.report, report=report, now=time)
+                self._keep((name, report.node), time, effect)
         else:
             parameters = parameters_in(read_string(data))
             self._keep((name, ''), time, lambda view: view.configuration(name, parameters))

@@ -8,9 +8,8 @@ from typing import Any, Final, NamedTuple
 from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics import FloatArray
 from needle_ros import contract
-from needle_ros.errors import printable
 from needle_ros.settings import is_number
-from needle_ros.status import ControllerStatus, node_of, NodeStatus, read_status, SteeringStatus
+from needle_ros.status import ControllerStatus, NodeReport, SteeringStatus
 from needle_ros.wire import Reading
 import numpy as np
 
@@ -194,7 +193,7 @@ class View:
         self._lines: dict[str, tuple[float, list[list[float]]]] = {}
         self._expected: dict[str, Any] | None = None
         self._configurations: dict[str, dict[str, Any]] = {}
-        self._nodes: dict[str, tuple[float, Any, NodeStatus | None]] = {}
+        self._nodes: dict[str, tuple[float, NodeReport]] = {}
 
     # Input.
 
@@ -229,11 +228,9 @@ class View:
             self._configurations[node] = parameters
             self.scene = scene(self._configurations)
 
-    def status(self, status: Any, now: float) -> None:
-        node = node_of(status.name)
-        if node in self._nodes or len(self._nodes) < _NODES:
-            values = {pair.key: pair.value for pair in status.values}
-            self._nodes[node] = now, status, read_status(values)
+    def report(self, report: NodeReport, now: float) -> None:
+        if report.node in self._nodes or len(self._nodes) < _NODES:
+            self._nodes[report.node] = now, report
 
     # Output.
 
@@ -274,7 +271,7 @@ class View:
 
     def _target(self) -> list[float | None] | None:
         """Return the target x, y, z [m]; x and z are None for a depth target."""
-        statuses = [status for _, _, status in self._nodes.values()]
+        statuses = [report.status for _, report in self._nodes.values()]
         for status in statuses:
             if isinstance(status, SteeringStatus) and status.target is not None:
                 return [number(part) for part in status.target]
@@ -285,7 +282,7 @@ class View:
         return self._vector(contract.TARGET.name) if not statuses else None
 
     def _hit_probability(self) -> float | None:
-        statuses = [status for _, _, status in self._nodes.values()]
+        statuses = [report.status for _, report in self._nodes.values()]
         found = [one.hit_probability for one in statuses if isinstance(one, SteeringStatus)]
         return next((number(one) for one in found if one is not None), None)
 
@@ -320,18 +317,16 @@ class View:
     def _node_rows(self, now: float) -> list[dict[str, Any]]:
         """Return the status of each node, sorted by level, the worst first."""
         nodes = []
-        for name, (received, status, typed) in self._nodes.items():
-            level = status.level
-            rejection = getattr(typed, 'last_rejection', '')
-            age = max(0.0, now - received)
+        for name, (received, report) in self._nodes.items():
+            typed, age = report.status, max(0.0, now - received)
             nodes.append(
                 {
-                    'name': printable(name),
-                    'level': level[0] if isinstance(level, bytes) else int(level),
-                    'words': printable(status.message),
+                    'name': name,
+                    'level': report.level,
+                    'words': report.message,
                     'age': round(age, 1),
                     'silent': age > _SILENT_NODE,
-                    'last_rejection': printable(rejection),
+                    'last_rejection': getattr(typed, 'last_rejection', ''),
                 }
             )
             if isinstance(typed, SteeringStatus) and typed.steps:

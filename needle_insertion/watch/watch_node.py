@@ -20,6 +20,7 @@ from needle_ros.contract import Qos, Topic
 from needle_ros.errors import JobError, MessageError
 from needle_ros.network import domain_of, stay_local
 from needle_ros.parameter_file import parameters_in
+from needle_ros.status import read_reports
 from needle_ros.wire import MessageReader, read_line, read_string
 from rclpy.context import Context
 from rclpy.experimental.events_executor import EventsExecutor
@@ -80,8 +81,8 @@ class WatchNode(Node):
         self._view.configuration(node, parameters_in(read_string(data)))
 
     def _on_diagnostics(self, array: Any, now: float) -> None:
-        for status in array.status:
-            self._view.status(status, now)
+        for report in read_reports(array):
+            self._view.report(report, now)
 
     def poll(self, now: float) -> None:
         """Process waiting messages at a time of a steady clock [s]."""

@@ -104,7 +104,7 @@ def record_aimed(
 def _is_done(state: State | None, time: float) -> bool:
     """Return whether `steering` has reached the target depth; raise `GraphError` on its errors."""
     phase, rejection = SteeringPhase.INACTIVE, ''
-    status = None if state is None else state.status
+    status = None if state is None else state.report.status
     if isinstance(status, SteeringStatus):
         phase, rejection = status.phase, status.last_rejection
         if phase is SteeringPhase.STOPPED:

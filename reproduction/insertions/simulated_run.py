@@ -109,7 +109,7 @@ class SimulatedRun:
         return publish
 
     def _show_start(self, name: str) -> None:
-        message = self.states[name].message if name in self.states else ''
+        message = self.states[name].report.message if name in self.states else ''
         self._show(f'starting {name}' + (f': {message}' if message else ''))
 
     def _is_recorded(self) -> bool:

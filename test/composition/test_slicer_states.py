@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 from needle_insertion.slicer.needle import NodeStates
+from support.watched import report
 
 
 def test_states_are_due_for_a_new_peer_after_a_change_and_each_second() -> None:
     states = NodeStates()
-    states.take('plant', 0, 'running', 10.0)
+    states.take(report('plant', 'running'), 10.0)
     assert not states.is_due('', 10.0)
     assert states.is_due('a', 10.0)
-    states.take('plant', 0, 'running', 10.5)
+    states.take(report('plant', 'running'), 10.5)
     assert not states.is_due('a', 10.5)
-    states.take('plant', 1, 'running', 10.6)
+    states.take(report('plant', 'running', level=1), 10.6)
     assert states.is_due('a', 10.6)
     assert not states.is_due('a', 11.5)
     assert states.is_due('b', 11.5)
@@ -24,8 +25,8 @@ def test_states_are_due_for_a_new_peer_after_a_change_and_each_second() -> None:
 
 def test_lines_show_silent_nodes_and_omit_removed_nodes() -> None:
     states = NodeStates()
-    states.take('recorder', 9, 'unknown level', 0.0)
-    states.take('plant', 2, 'halted', 52.0)
+    states.take(report('recorder', 'unknown level', level=9), 0.0)
+    states.take(report('plant', 'halted', level=2), 52.0)
     assert states.lines(58.0) == [
         'plant [ERROR, silent for 6 s]: halted',
         'recorder [9, silent for 58 s]: unknown level',
@@ -36,8 +37,8 @@ def test_lines_show_silent_nodes_and_omit_removed_nodes() -> None:
 def test_number_of_nodes_is_limited() -> None:
     states = NodeStates()
     for number in range(30):
-        states.take(f'node_{number:02d}', 0, 'idle', 0.0)
-    states.take('node_00', 0, 'active', 1.0)
+        states.take(report(f'node_{number:02d}', 'idle'), 0.0)
+    states.take(report('node_00', 'active'), 1.0)
     lines = states.lines(1.0)
     assert len(lines) == 20
     assert lines[0] == 'node_00 [OK]: active'

@@ -46,8 +46,8 @@ from support.watched import (
     expected,
     marker,
     RATE,
+    report,
     shape,
-    status,
     TARGET,
     write_watched,
 )
@@ -156,7 +156,7 @@ def test_silent_topics_and_nodes_are_reported() -> None:
     view = View()
     view.reading('joint_states', joints(('insertion',), (0.05,), (), ()), 0.0)
     view.reading('target', numbers(0.0, 0.1, 0.0), 0.0)
-    view.status(status('/plant', 'active'), 0.0)
+    view.report(report('/plant', 'active'), 0.0)
     assert view.frame(0.9)['silent'] == {}
     seen = view.frame(2.5)
     assert seen['silent'] == {'joint_states': 2.5}
@@ -168,11 +168,11 @@ def test_silent_topics_and_nodes_are_reported() -> None:
 def test_nodes_are_sorted_by_level() -> None:
     """Each node once, with its newest status; control characters are replaced."""
     view = View()
-    view.status(status('/a', 'active'), 0.0)
-    view.status(status('/b', 'no\njoint_states\x1b[2J', level=1), 0.0)
-    view.status(status('/c', 'active'), 0.0)
+    view.report(report('/a', 'active'), 0.0)
+    view.report(report('/b', 'no\njoint_states\x1b[2J', level=1), 0.0)
+    view.report(report('/c', 'active'), 0.0)
     stopped = SteeringStatus(step=3, steps=20, hit_probability=0.25, last_rejection='a\nb')
-    view.status(status('/c', 'stopped', stopped, level=2), 1.0)
+    view.report(report('/c', 'stopped', stopped, level=2), 1.0)
     nodes = view.frame(1.0)['nodes']
     assert [(one['name'], one['level']) for one in nodes] == [('/c', 2), ('/b', 1), ('/a', 0)]
     assert [nodes[0][key] for key in ('step', 'steps', 'last_rejection')] == [3, 20, 'a b']
@@ -186,15 +186,15 @@ def test_target_is_accepted_target_of_diagnostics() -> None:
     view = View()
     view.reading('target', numbers(1e-3, 0.2, 0.0), 0.0)
     assert view.frame(0.0)['target'] == [1e-3, 0.2, 0.0]
-    view.status(status('/controller', 'active', ControllerStatus()), 0.0)
+    view.report(report('/controller', 'active', ControllerStatus()), 0.0)
     assert view.frame(0.0)['target'] is None
-    view.status(status('/controller', 'active', ControllerStatus(target=0.08)), 0.0)
+    view.report(report('/controller', 'active', ControllerStatus(target=0.08)), 0.0)
     assert view.frame(0.0)['target'] == [None, 0.08, None]
     told(view, 'steering')
     assert view.frame(0.0)['target'] is None
-    view.status(status('/steering', 'inserts', SteeringStatus(target=TARGET)), 0.0)
+    view.report(report('/steering', 'inserts', SteeringStatus(target=TARGET)), 0.0)
     assert view.frame(0.0)['target'] == list(TARGET)
-    view.status(status('/steering', 'waits', SteeringStatus()), 0.0)
+    view.report(report('/steering', 'waits', SteeringStatus()), 0.0)
     assert view.frame(0.0)['target'] is None
 
 

@@ -247,7 +247,7 @@ def test_steering_preloads_an_insertion(
     one.send(1e-3, 0.031, -1e-3)
 
     def ended() -> bool:
-        status = one.operator.states['steering'].status
+        status = one.operator.states['steering'].report.status
         ends = (SteeringPhase.DONE, SteeringPhase.STOPPED)
         return isinstance(status, SteeringStatus) and status.phase in ends
 

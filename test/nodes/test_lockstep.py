@@ -34,7 +34,7 @@ from needle_insertion.graph.lockstep import RunSample
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.replay.rerun import verify
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.status import ControllerStatus, node_of, SteeringPhase, SteeringStatus
+from needle_ros.status import ControllerStatus, read_reports, SteeringPhase, SteeringStatus
 from needle_ros.timing import seconds
 import numpy as np
 import pytest
@@ -92,9 +92,9 @@ def drive(
         health: dict[str, ControllerStatus] = {}
 
         def take(message: DiagnosticArray) -> None:
-            for status in message.status:
-                values = {pair.key: pair.value for pair in status.values}
-                health[node_of(status.name)] = ControllerStatus.from_values(values)
+            for report in read_reports(message):
+                if isinstance(report.status, ControllerStatus):
+                    health[report.node] = report.status
 
         probe.create_subscription(DiagnosticArray, '/diagnostics', take, 10)
         probe.create_subscription(JointState, 'tracking_error', errors.append, EVERY)
@@ -345,7 +345,7 @@ def steer(
             # On a busy machine the first samples may arrive before the first status.
             if 'steering' not in run.states:
                 return sample.time < 1.0
-            status = run.states['steering'].status
+            status = run.states['steering'].report.status
             assert isinstance(status, SteeringStatus)
             if end == inf and status.phase is SteeringPhase.DONE:
                 end = sample.time + 0.5

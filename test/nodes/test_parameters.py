@@ -13,7 +13,7 @@ from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.nodes import NODES
 from needle_ros.base_node import LATCHED
-from needle_ros.status import node_of, STALE
+from needle_ros.status import read_reports, STALE
 import pytest
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters
@@ -182,7 +182,7 @@ def test_status_names_node_task_and_hardware(
         found = [status for array in received for status in array.status]
         assert {status.name for status in found} <= {f'{full}: state'}
         assert {status.hardware_id for status in found} <= {hardware}
-        assert {node_of(status.name) for status in found} <= {full}
+        assert {one.node for array in received for one in read_reports(array)} <= {full}
         return {status.level for status in found}
 
     ros_graph.spin_until(levels, 'the status')

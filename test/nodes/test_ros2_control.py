@@ -30,7 +30,7 @@ from needle_identification.recorder_node import is_hidden
 from needle_insertion.replay.rerun import verify
 from needle_ros import contract
 from needle_ros.base_node import COMMAND, message_class, SENSOR
-from needle_ros.status import node_of, PlantStatus
+from needle_ros.status import PlantStatus, read_reports
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -95,10 +95,9 @@ class Driver:
                 self.state[name, kind] = getattr(message, kind)[k]
 
     def _on_health(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if node_of(status.name) == '/plant':
-                values = {item.key: item.value for item in status.values}
-                self.status = PlantStatus.from_values(values)
+        for report in read_reports(message):
+            if isinstance(report.status, PlantStatus):
+                self.status = report.status
 
     def write(self) -> None:
         """Send a message like `JointStateTopicSystem::write` with a threshold of -1."""

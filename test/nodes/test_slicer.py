@@ -14,14 +14,14 @@ import sys
 from typing import Any
 
 from benchmarks.igtl_peer import free_port, Peer, Told
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped
 from needle_insertion.slicer.link import Frame, Frames, HEADER, LARGEST
 from needle_insertion.slicer.needle import LINE, MEASURED, Registration
 from needle_insertion.slicer.slicer_node import SlicerNode
 from needle_planning import read_plan, write_plan
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.status import node_of, SlicerPhase, SlicerStatus
+from needle_ros.status import LEVELS, read_reports, SlicerPhase, SlicerStatus
 import numpy as np
 import pyigtl
 from pyigtl.messages import MessageBase
@@ -418,17 +418,17 @@ def test_target_flood_is_reported_once_and_the_newest_is_used(
 
 def test_port_in_use_is_reported_and_retried(room: Room) -> None:
     """On /diagnostics; the node listens as soon as the port is free."""
-    levels: list[bytes] = []
+    levels: list[int] = []
 
     def take(message: DiagnosticArray) -> None:
-        levels.extend(one.level for one in message.status if node_of(one.name) == '/slicer')
+        levels.extend(one.level for one in read_reports(message) if one.node == '/slicer')
 
     room.probe.create_subscription(DiagnosticArray, '/diagnostics', take, 10)
     with closing(socket.create_server(('127.0.0.1', room.port))):
         room.slicer()
         room.until(lambda: room.status().phase is SlicerPhase.ERROR, 'the error')
         assert 'the port is in use' in room.status().error
-        room.until(lambda: DiagnosticStatus.ERROR in levels, 'the level')
+        room.until(lambda: LEVELS.index('ERROR') in levels, 'the level')
     room.until(lambda: room.status().phase is SlicerPhase.WAITING, 'the port')
     with closing(socket.create_connection(('127.0.0.1', room.port))):
         room.until(lambda: room.status().phase is SlicerPhase.CONNECTED, 'the peer')

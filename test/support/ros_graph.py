@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from diagnostic_msgs.msg import DiagnosticArray
 from needle_insertion.graph.ros_graph import Graph
 from needle_ros.base_node import BaseNode
-from needle_ros.status import NodeStatus, read_status
+from needle_ros.status import NodeStatus, read_reports
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -55,8 +55,8 @@ class RosGraph(Graph):
 
         # Each once: a condition is evaluated after each event of the graph.
         def take(message: DiagnosticArray) -> None:
-            pairs = [{one.key: one.value for one in status.values} for status in message.status]
-            received.extend(one for one in map(read_status, pairs) if isinstance(one, kind))
+            statuses = [one.status for one in read_reports(message)]
+            received.extend(one for one in statuses if isinstance(one, kind))
 
         node.create_subscription(DiagnosticArray, '/diagnostics', take, qos)
         return received

@@ -4,12 +4,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Final
 
 from needle_identification import BagWriter
 from needle_identification.bags.messages import encode, message_type
 from needle_ros import contract
-from needle_ros.status import ControllerStatus, NodeStatus, PlantStatus, SteeringStatus
+from needle_ros.status import (
+    ControllerStatus,
+    NodeReport,
+    NodeStatus,
+    PlantStatus,
+    read_reports,
+    SteeringStatus,
+)
 import numpy as np
 from support.samples import EPOCH
 
@@ -96,6 +104,12 @@ def status(name: str, message: str, typed: NodeStatus | None = None, level: int 
         'diagnostic_msgs/msg/DiagnosticStatus', level=level, name=name, message=message,
         hardware_id='', values=pairs,
     )  # fmt: skip
+
+
+def report(*about: Any, **more: Any) -> NodeReport:
+    """Create the report of a node from its `status`."""
+    [found] = read_reports(SimpleNamespace(status=[status(*about, **more)]))
+    return found
 
 
 def expected(x: float, z: float, deviation: float, depth: float = TARGET[1]) -> Any:
