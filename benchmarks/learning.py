@@ -24,6 +24,7 @@ from gymnasium.vector import VectorEnv
 from needle_controller import LAWS, STEERING_LAWS
 from needle_dynamics import FloatArray
 from needle_dynamics.arrays import BoolArray
+from needle_ros.quantities import NORMAL
 from needle_study.gym.insertion import InsertionVectorEnv
 from needle_study.gym.steering import PRIOR, SteeringVectorEnv
 import numpy as np
@@ -64,7 +65,6 @@ _NOTES: Final = {
 }
 
 #: Standard normal quantile of a 95 % interval.
-_NORMAL: Final = 1.96
 
 
 class LearningPlan(NamedTuple):
@@ -174,7 +174,7 @@ def train(make: Callable[[int], VectorEnv[Any, Any, Any]], steps: int) -> Policy
 
 def interval(values: FloatArray) -> tuple[float, float]:
     """Return the mean, and half the width of its 95 % interval."""
-    return float(values.mean()), float(_NORMAL * values.std(ddof=1) / np.sqrt(len(values)))
+    return float(values.mean()), float(NORMAL * values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def learned(tick: Tick, environments: Environments, steps: int) -> dict[str, Maker]:

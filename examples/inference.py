@@ -52,7 +52,7 @@ DRAWN, TRIALS, DRAWS = 20_000, 1000, 1000
 def population(count: int, seed: int) -> dict[str, FloatArray]:
     """Draw needles as `needle study` does."""
     study = {'scenario': 'steering', 'samples': count, 'seed': seed, 'population': POPULATION}
-    return build_study(study).draw(range(count))
+    return build_study(study).draw(0, count)
 
 
 def guides() -> FloatArray:

@@ -150,17 +150,13 @@ class LinearLoop:
         #: Memory and command after a period, from the state without unmodeled delay.
         self._rows = np.array([answer(unit) for unit in np.eye(first + delay)]).T
 
-    def transition_matrix(self, unmodeled: int = 0, plant: Axis | None = None) -> FloatArray:
+    def transition_matrices(self, unmodeled: int, plants: Sequence[Axis]) -> FloatArray:
         """
-        Return the transition matrix over one period, exact for the linear part.
+        Return the transition matrices over one period, exact for the linear part, (m, k, k).
 
-        ``unmodeled`` periods of delay are unknown to the law. ``plant`` is the true axis, without
-        its dry friction.
+        ``unmodeled`` periods of delay are unknown to the law. The m ``plants`` are the true axes,
+        without their dry friction.
         """
-        (matrix,) = self._matrices(unmodeled, [plant or self._law.axis])
-        return np.asarray(matrix)
-
-    def _matrices(self, unmodeled: int, plants: Sequence[Axis]) -> FloatArray:
         late, first = self._delay + unmodeled, self._first
         known = [*range(first), *range(first + unmodeled, first + late)]
         # With the new command as last entry, which acts at once without a delay.
@@ -180,7 +176,7 @@ class LinearLoop:
 
     def spectral_radii(self, unmodeled: int, plants: Sequence[Axis]) -> FloatArray:
         """Return `spectral_radius` of each axis, shape (len(plants),)."""
-        poles = np.linalg.eigvals(self._matrices(unmodeled, plants))
+        poles = np.linalg.eigvals(self.transition_matrices(unmodeled, plants))
         return np.asarray(np.abs(poles).max(axis=1))
 
 

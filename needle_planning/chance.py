@@ -286,7 +286,7 @@ def _studies(
 
 def _tables(study: Study) -> dict[str, Any]:
     """Return sampled values of a population in a table for each cause, which is one dimension."""
-    drawn = study.draw(range(min(study.samples, _ROWS)))
+    drawn = study.draw(0, min(study.samples, _ROWS))
     causes = {
         name: next(one for one, begins in CAUSES.items() if name.startswith(begins))
         for name in drawn
@@ -341,7 +341,7 @@ def _shafts(study: Study, count: int) -> FloatArray:
     """Return the complete needles of the first samples, shape (count, k, 3)."""
     if not count:
         return np.empty((0, 0, 3))
-    drawn = study.draw(range(count))
+    drawn = study.draw(0, count)
     samples = ({name: float(one[k]) for name, one in drawn.items()} for k in range(count))
     found = [
         study.scenario.shaft(sample, study.design.noise(k))  # type: ignore[attr-defined]

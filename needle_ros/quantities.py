@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parse text: quantities with units, such as ``4mm`` and ``20 s``, targets, and signed axes."""
+"""Quantities: text with units, such as ``4mm`` and ``20 s``, targets, axes, and intervals."""
 
 from collections.abc import Mapping
 from math import isfinite, pi
@@ -33,6 +33,8 @@ EXAMPLES: Final = {unit: example.split()[-1] for unit, (_, example, _) in _KINDS
 TARGET_HELP: Final = 'x,y,z, where y is the depth, such as 4mm,100mm,-2mm; m without a unit'
 
 AXES: Final = ('x', 'y', 'z')  #: Axes of a frame, in the order of message fields.
+
+NORMAL: Final = 1.96  #: Half width of a 95 % interval of a normal quantity [standard deviations].
 
 
 def accepted_units(unit: str) -> str:

@@ -41,9 +41,9 @@ class Study:
     population: Mapping[str, Distribution]  #: by variable; the others have their defaults
     document: Mapping[str, Any]  #: content of the study file
 
-    def draw(self, numbers: FloatArray | Sequence[int]) -> dict[str, FloatArray]:
-        """Return the sampled values of consecutive sample numbers by variable."""
-        parts = self.design.parts(int(numbers[0]), len(numbers))
+    def draw(self, first: int, count: int) -> dict[str, FloatArray]:
+        """Return the values of samples from a number on, by variable, shape (count,) each."""
+        parts = self.design.parts(first, count)
         of = dict(zip(dimensions(self.population), parts.T, strict=True))
         return {name: one.quantiles(of[one.rows or name]) for name, one in self.population.items()}
 
@@ -64,7 +64,7 @@ class Study:
     def rows(self, first: int, count: int) -> dict[str, FloatArray]:
         """Compute samples from a number on: number, sampled values and metrics."""
         numbers = range(first, first + count)
-        drawn = self.draw(numbers)
+        drawn = self.draw(first, count)
         streams = [self.design.noise(number) for number in numbers]
         return {
             'sample': np.arange(first, first + count, dtype=np.float64),

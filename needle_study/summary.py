@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
+from needle_ros.quantities import NORMAL
 from needle_study.designs import RandomDesign, REPLICATES, SaltelliDesign
 from needle_study.study import dimensions, Study
 import numpy as np
 from scipy.special import stdtrit
 from scipy.stats import binom
 
-_NORMAL: Final = 1.96  #: half-width of a 95 % interval over the standard deviation
 _TAIL: Final = 0.025  #: probability of an interval above the true value, and below it
 
 #: Groups of samples in the estimate of a variance fraction, and the least number of samples.
@@ -109,7 +109,7 @@ def probability(parts: Iterable[FloatArray], design: RandomDesign | None = None)
     n, yes = sums.sum(axis=1).tolist()
     if n == 0:
         return Estimate(np.nan, 0.0, 1.0, 0)
-    p, size, z = yes / n, _size(sums), _NORMAL
+    p, size, z = yes / n, _size(sums), NORMAL
     middle = (p + z * z / (2 * size)) / (1.0 + z * z / size)
     half = z / (1.0 + z * z / size) * sqrt(p * (1.0 - p) / size + z * z / (4 * size * size))
     return Estimate(p, max(0.0, middle - half), min(1.0, middle + half), int(n))
@@ -134,7 +134,7 @@ def _size(sums: FloatArray) -> float:
     if variance == 0.0 or not n.all():
         return float(n.sum())
     # The variance has an error: Student's distribution.
-    wider = float(stdtrit(count - 1, 1.0 - _TAIL)) / _NORMAL
+    wider = float(stdtrit(count - 1, 1.0 - _TAIL)) / NORMAL
     return p * (1.0 - p) / (variance * wider**2)
 
 

@@ -11,7 +11,6 @@ from needle_controller.compiled.hypotheses import MOST_MISSING, MOST_SAME
 from needle_controller.steering.law import (
     checked_tip,
     GuideSetpoint,
-    NORMAL,
     SteeringFaultError,
     SteeringLaw,
     TipEstimate,
@@ -20,6 +19,7 @@ from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import EventLog, Severity
+from needle_ros.quantities import NORMAL
 import numpy as np
 
 _OUTLIER: Final = 5.0  #: Distance of an outlier from the median, in standard deviations.

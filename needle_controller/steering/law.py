@@ -13,6 +13,7 @@ from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_ros.errors import JobError, NeedleError, ParameterError, ShapeError
+from needle_ros.quantities import NORMAL
 from needle_ros.settings import find_class
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,7 +31,7 @@ STEERING_LAWS: Final[Mapping[str, str]] = {
 DEFAULT_LAW: Final = 'multi_hypothesis'  #: Default law of node, `needle steer` and studies.
 
 #: Quantiles of the 95 % interval of a normal distribution, and of the 95 % ellipse.
-NORMAL, _CHI_SQUARED = 1.96, 5.991
+_CHI_SQUARED: Final = 5.991
 
 
 class SteeringFaultError(JobError):

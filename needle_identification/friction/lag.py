@@ -17,8 +17,8 @@ from needle_identification.friction.design import Design, FEWEST_SAMPLES, select
 from needle_identification.friction.filtering import FilteredSignals
 from needle_identification.friction.terms import NeedleMotion, regressors
 from needle_identification.recordings.recording import Recording
+from needle_ros.quantities import NORMAL
 import numpy as np
-from scipy.special import ndtri
 
 _LARGEST_LAG: Final = 0.25  # largest lag of the coarse search [s]
 _BETTER: Final = 0.5  # largest fraction of the misfit that remains with an accepted coarse lag
@@ -151,6 +151,6 @@ def lag_estimate(design: Design, fit: Regression) -> ParameterEstimate:
     period = design.signals.period
     spline = _SPLINE_ERROR * period * (design.signals.settings.cutoff * period) ** 4
     value, low, high = design.lag + np.array([fit.values[-1], *fit.interval()[-1]])
-    half_width = hypot(0.5 * (high - low), float(ndtri(0.975)) * spline)
+    half_width = hypot(0.5 * (high - low), NORMAL * spline)
     error = hypot(float(fit.errors[-1]), spline)
     return with_half_width(_UNKNOWN, float(value), error, half_width)

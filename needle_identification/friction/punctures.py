@@ -18,8 +18,8 @@ from needle_identification.estimation.estimate import ParameterEstimate, with_ha
 from needle_identification.estimation.memory import stretches
 from needle_identification.estimation.regression import DEVIATION_OVER_MEDIAN, Regression
 from needle_identification.friction.design import Design
+from needle_ros.quantities import NORMAL
 import numpy as np
-from scipy.special import ndtri
 
 _CLEAR: Final = 8.0  # smallest drop [standard deviations of other changes of the force]
 _UNKNOWN_FRICTION: Final = 0.5  # model error of a change of friction, as a fraction
@@ -93,12 +93,11 @@ def _puncture(design: Design, force: FloatArray, peak: int, noise: float) -> Pun
     time = np.arange(-width, 0) - reach
     level = np.polyfit(time, before, 1)[1]
     drop = float(level - after.mean())
-    half_width = float(ndtri(0.975))
     # Variance of two means, with extrapolation by half a window and half the filter.
     error = noise * sqrt(1.0 + 1.5 * (1.0 + 2.0 * reach / width) ** 2)
     place = hypot(reach * signals.period * float(design.velocity[at]), 1e-6) / sqrt(3.0)
     return Puncture(
         time=float(signals.time[at]),
-        depth=with_half_width(_DEPTH, float(design.depth[at]), place, half_width * place),
-        drop=with_half_width(_DROP, drop, error, half_width * error),
+        depth=with_half_width(_DEPTH, float(design.depth[at]), place, NORMAL * place),
+        drop=with_half_width(_DROP, drop, error, NORMAL * error),
     )

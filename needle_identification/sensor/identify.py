@@ -34,6 +34,7 @@ from needle_identification.sensor.noise import (
     NoiseLikelihood,
     RATIOS,
 )
+from needle_ros.quantities import NORMAL
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import stdtrit
@@ -275,7 +276,7 @@ def _biases(one: SensorRecording, fit: NoiseFit) -> Iterator[ParameterEstimate]:
 def _delay(one: SensorRecording, fit: NoiseFit, delay: float) -> ParameterEstimate:
     if one.moves:
         error = sqrt(float(fit.covariance[-1, -1]))
-        low, high = delay - 1.96 * error, delay + 1.96 * error
+        low, high = delay - NORMAL * error, delay + NORMAL * error
         noise = exp(fit.log_noise) * sqrt(1.0 + exp(fit.log_ratio))
         clear = sqrt(float(one.true_tip.var(axis=0).mean())) > _CLEAR * noise
         if clear and error < _VAGUE and _DELAYS[0] < low < high < _DELAYS[1]:

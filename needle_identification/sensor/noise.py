@@ -26,6 +26,7 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import FloatArray
 from needle_identification.estimation.estimate import estimated, ParameterEstimate
 from needle_identification.estimation.memory import precision
+from needle_ros.quantities import NORMAL
 import numpy as np
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.optimize import minimize
@@ -151,7 +152,7 @@ class NoiseLikelihood:
 
 def log_interval(log_value: float, variance: float) -> tuple[float, float]:
     """Return the 95 % interval of a positive value from its logarithm."""
-    half = 1.96 * sqrt(variance)
+    half = NORMAL * sqrt(variance)
     return exp(log_value - half), exp(log_value + half)
 
 
@@ -187,7 +188,7 @@ def fit_losses(time: FloatArray) -> tuple[ParameterEstimate, ParameterEstimate]:
         error = sqrt(fraction * (1.0 - fraction) / total)
         return _dropout(fraction, error, binomial_interval(lost, total)), _NO_BURSTS
     # The logit of a fraction is nearly normal.
-    logit, half = log(fraction) - log1p(-fraction), 1.96 * error / (fraction * (1.0 - fraction))
+    logit, half = log(fraction) - log1p(-fraction), NORMAL * error / (fraction * (1.0 - fraction))
     low, high = (1.0 / (1.0 + exp(-at)) for at in (logit - half, logit + half))
     duration = -period / ((1.0 - fraction) * log(kept))
     # Derivatives of the logarithm of the duration.
@@ -195,7 +196,7 @@ def fit_losses(time: FloatArray) -> tuple[ParameterEstimate, ParameterEstimate]:
     by_begin = end / whole / (1.0 - fraction) + 1.0 / (kept * log(kept))
     by_end = -begin / whole / (1.0 - fraction) + 1.0 / (kept * log(kept))
     log_error = sqrt(by_begin**2 * variance[0] + by_end**2 * variance[1])
-    ends = duration * exp(-1.96 * log_error), duration * exp(1.96 * log_error)
+    ends = duration * exp(-NORMAL * log_error), duration * exp(NORMAL * log_error)
     burst = estimated('dropout_time', 'T', 's', duration, duration * log_error, ends)
     return _dropout(fraction, error, (low, high)), burst
 

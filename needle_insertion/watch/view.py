@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics import FloatArray
 from needle_ros import contract
+from needle_ros.quantities import NORMAL
 from needle_ros.settings import is_number
 from needle_ros.status import ControllerStatus, NodeReport, SteeringStatus
 from needle_ros.wire import Reading
@@ -33,7 +34,6 @@ _SILENT_NODE: Final = 3.0  #: timeout of the status of a node, which is publishe
 _POINTS: Final = 120
 _NODES: Final = 64
 
-_NORMAL: Final = 1.96  #: half width of a 95 % interval, in standard deviations
 
 _Place = Sequence[float | None]  #: Coordinates [m], None if unknown.
 
@@ -215,7 +215,7 @@ class View:
         x, z = (sqrt(max(0.0, one)) for one in (xx, zz))
         self._expected = {
             'at': [number(one) for one in (at.x, at.y, at.z)],
-            'half': [number(_NORMAL * one) for one in (x, z)],
+            'half': [number(NORMAL * one) for one in (x, z)],
             # Correlation of x and z, for the ellipse.
             'correlation': number(xz / (x * z)) if x * z > 0.0 else 0.0,
         }

@@ -147,7 +147,7 @@ def test_samples_follow_distributions_and_correlations(design: str) -> None:
         'skin': {'gamma': [2.0, 0.5], 'within': [0.0, 10.0]},
         'bending_length': {'lognormal': [1.2, 0.1], 'within': [0.2, 5.0]},
     }, 'correlations': [['tilt_x', 'tilt_z', 0.8]]})  # fmt: skip
-    drawn = study.draw(range(4096))
+    drawn = study.draw(0, 4096)
     # Five standard errors of 4096 independent samples; the error of Sobol is smaller.
     near = 5.0 / sqrt(4096.0)
     assert drawn['tilt_x'].mean() == pytest.approx(0.01, abs=0.002 * near)
@@ -174,9 +174,9 @@ def test_samples_are_independent_of_the_order_of_variables(design: str) -> None:
     for names in (list(given), list(turned)):
         assert names != sorted(names)
     one, other = (build_study({**small(design), 'population': each}) for each in (given, turned))
-    whole = one.draw(range(20))
+    whole = one.draw(0, 20)
     for study in (other, build_study(json.loads(order(one))['study'])):
-        drawn = study.draw(range(20))
+        drawn = study.draw(0, 20)
         for name, values in whole.items():
             assert np.array_equal(drawn[name], values)
 
@@ -186,7 +186,7 @@ def test_groups_of_a_saltelli_design_have_one_variable_in_common() -> None:
     study = build_study({**small('saltelli'), 'samples': 160})
     names = list(study.population)
     size = len(names) + 3
-    drawn = study.draw(range(160))
+    drawn = study.draw(0, 160)
     noise = [study.design.noise(k).random() for k in range(160)]
     values = np.array([noise, *drawn.values()]).T[: 160 // size * size].reshape(-1, size, size - 2)
     first, second = values[:, 0], values[:, 1]
@@ -209,7 +209,7 @@ def test_variables_of_a_table_have_values_of_the_same_row(tmp_path: Path) -> Non
     }
     file.write_text(yaml.safe_dump({**SMALL, 'correlations': [], 'population': population}))
     study = build_study(json.loads(order(read_study(file)))['study'])
-    drawn = study.draw(range(480))
+    drawn = study.draw(0, 480)
     rows, counts = np.unique(
         np.array([drawn['bending_length'], drawn['skin']]).T, axis=0, return_counts=True
     )
@@ -236,7 +236,7 @@ def test_latin_design_has_one_sample_per_stratum(samples: int) -> None:
     drawn = build_study(
         {'scenario': 'steering', 'samples': samples, 'seed': 8, 'design': 'latin',
          'population': population}
-    ).draw(range(samples))  # fmt: skip
+    ).draw(0, samples)  # fmt: skip
     strata = np.array([np.floor(drawn[name] / 0.5 * samples) for name in names])
     assert np.array_equal(np.sort(strata, axis=1), np.tile(np.arange(samples), (3, 1)))
     if samples >= 64:
@@ -253,7 +253,7 @@ def test_correlations_keep_the_strata_of_a_latin_design(correlation: float) -> N
         {'scenario': 'steering', 'samples': samples, 'seed': 8, 'design': 'latin',
          'population': {name: {'uniform': [0.0, 0.5]} for name in names},
          'correlations': [['target_x', 'tilt_x', correlation]]}
-    ).draw(range(samples))  # fmt: skip
+    ).draw(0, samples)  # fmt: skip
     strata = np.array([np.floor(drawn[name] / 0.5 * samples) for name in names])
     assert np.array_equal(np.sort(strata, axis=1), np.tile(np.arange(samples), (3, 1)))
     found = np.corrcoef(strata)
@@ -743,7 +743,7 @@ def test_quantiles_at_zero_and_one_are_finite(monkeypatch: pytest.MonkeyPatch) -
     study = build_study(SMALL)
     for part in (0.0, 1.0):
         monkeypatch.setattr(SobolDesign, 'uniform', lambda *_, at=part: np.full((3, 5), at))
-        for name, values in study.draw(range(3)).items():
+        for name, values in study.draw(0, 3).items():
             variable = study.scenario.variables[name]
             assert ((values >= variable.low) & (values <= variable.high)).all()
 

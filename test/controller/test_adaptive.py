@@ -151,7 +151,7 @@ def test_missing_samples_are_excluded_from_learning() -> None:
 def test_learning_does_not_change_the_poles() -> None:
     """The poles equal the poles of inverse dynamics."""
     other = InverseDynamics(axis=PHANTOM, gains=InverseDynamicsGains(), period=PERIOD)
-    own, known = (LinearLoop(one, 1).transition_matrix(1) for one in (law(), other))
+    own, known = (LinearLoop(one, 1).transition_matrices(1, [PHANTOM]) for one in (law(), other))
     assert_allclose(own, known, rtol=1e-12)
 
 

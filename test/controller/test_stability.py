@@ -45,7 +45,7 @@ def test_transition_matrix_equals_the_loop(delay: int, unmodeled: int, filter_ti
     axis = PHANTOM.without_coulomb()
     gains = PidGains(tolerance=0.0, filter_time=filter_time)
     law = Pid(axis=axis, gains=gains, period=PERIOD)
-    matrix = LinearLoop(law, delay).transition_matrix(unmodeled)
+    (matrix,) = LinearLoop(law, delay).transition_matrices(unmodeled, [axis])
     state = np.zeros(len(matrix))
     state[0] = 1e-3
     loop = SampledLoop(law, delay, np.inf)

@@ -15,10 +15,11 @@ from needle_controller.reference.path import Path
 from needle_controller.reference.quintic import Quintic
 from needle_controller.reference.setpoint import Setpoint
 from needle_controller.steering.guarded_law import TipMeasurements
-from needle_controller.steering.law import NORMAL, TipEstimate
+from needle_controller.steering.law import TipEstimate
 from needle_controller.steering.motion import duration_of, JointMotion, smooth
 from needle_dynamics import ParameterError
 from needle_ros.event_log import Severity
+from needle_ros.quantities import NORMAL
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.system_state import CLEAR_STOP, STOP
 from needle_ros.wire import Reading
