@@ -38,7 +38,7 @@ from needle_identification import (
     StiffnessSettings,
 )
 from needle_insertion.report.paper_tables import FORCE_LEVELS
-from needle_ros.process import ONE_THREAD
+from needle_ros.process import cores, ONE_THREAD
 from needle_ros.process_pool import processes
 import numpy as np
 from reproduction.population import draw_friction, draw_stiffness
@@ -412,7 +412,7 @@ def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
         raise ParameterError(f'--recordings must be in [2, {_MOST_RECORDINGS}], got {recordings}')
     if seed < 0:
         raise ParameterError(f'--seed must be >= 0, got {seed}')
-    workers = os.cpu_count() or 1
+    workers = cores()
     rows: list[Row] = []
     for name, study in STUDIES.items():
         found: list[CalibrationResult] = []

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, isfinite, pi
-import os
 from typing import Any, Final, NamedTuple
 
 from benchmarks.measure import Bar
@@ -32,6 +31,7 @@ from needle_controller.commissioning import Commissioning, CommissioningSettings
 from needle_controller.supervisor import Supervisor
 from needle_dynamics import NeedleParameters
 from needle_ros.errors import ParameterError
+from needle_ros.process import cores
 from needle_ros.process_pool import processes
 from needle_ros.status import CommissioningPhase
 from needle_ros.timing import NANOSECONDS
@@ -361,7 +361,7 @@ def measure(case: ErrorCase) -> ErrorOutcome:
 def compare(tick: Tick, errors: int = 504, correct: int = 90) -> Answer:
     """Measure random errors and correct configurations."""
     tick('sessions in simulated time')
-    with processes(os.cpu_count() or 1) as pool:
+    with processes(cores()) as pool:
         return conclude(list(pool.map(measure, cases(errors, correct))))
 
 

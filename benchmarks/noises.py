@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import exp, pi, sqrt
-import os
 from typing import Final, NamedTuple
 
 from benchmarks.calibration import COVERAGE, studied
@@ -39,6 +38,7 @@ from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray
 from needle_identification import FrictionSettings, identify_friction, Recording
+from needle_ros.process import cores
 import numpy as np
 from scipy.signal import lfilter
 
@@ -356,7 +356,7 @@ def _outcome(name: str, line: NoiseRow, rng: np.random.Generator) -> NoiseOutcom
 def compare(tick: Tick, recordings: int = 1000, seed: int = 2014) -> Answer:
     """Compare estimates and suggested terms with the true parameters."""
     found: dict[str, list[NoiseOutcome]] = {name: [] for name in (*LINES, *FURTHER)}
-    workers = os.cpu_count() or 1
+    workers = cores()
     for number, part in enumerate(studied(outcomes, recordings, seed, workers), 1):
         tick(f'noises, {number} of {recordings}')
         for one in part:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import inf, nan
-import os
 from typing import Final, NamedTuple, TypeAlias
 
 from benchmarks import steering_faults, strangers
@@ -21,6 +20,7 @@ from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, TIP_DEFLECTION, WRENCH_COMMAND
 from needle_ros.errors import ParameterError
+from needle_ros.process import cores
 from needle_ros.process_pool import processes
 from needle_ros.system_state import CLEAR_STOP
 from needle_ros.timing import NANOSECONDS
@@ -304,7 +304,7 @@ def compare(tick: Tick, fault: str = '') -> Answer:
     if not chosen:
         return [], []
     tick('simulated time')
-    with processes(os.cpu_count() or 1) as pool:
+    with processes(cores()) as pool:
         found = list(pool.map(measure, chosen))
     sections = [_section(topic, chosen, found) for topic in dict.fromkeys(c.topic for c in chosen)]
     bars = [

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
 from math import cos, inf, pi, sin, sqrt
-import os
 from typing import Final, NamedTuple
 
 from benchmarks.measure import Bar
@@ -24,6 +23,7 @@ from needle_controller.steering.simulation import GroundTruth, sample_truth, sim
 from needle_dynamics import FloatArray, NeedleParameters, SteeringParameters
 from needle_dynamics.needles import NEEDLES
 from needle_dynamics.steering.parameters import tissue_of
+from needle_ros.process import cores
 from needle_ros.process_pool import processes
 import numpy as np
 from scipy.optimize import lsq_linear
@@ -309,7 +309,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
         ('ultrasound', 0.3): {'mean': 0.35},
     }
     others: list[tuple[str, ...]] = []
-    with processes(os.cpu_count() or 1) as pool:
+    with processes(cores()) as pool:
         for sensor, spread in CASES:
             case = f'{sensor}, +-{100.0 * spread:g} %'
             tick(case)

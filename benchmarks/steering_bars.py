@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import os
 
 from benchmarks.measure import Bar
 from benchmarks.page import Answer, PageSection, Tick
@@ -21,6 +20,7 @@ from benchmarks.steering_faults import (
     word_of,
 )
 from benchmarks.steering_nodes import CALLS, COMMAND, NODES, RESPONSE, ROBOT
+from needle_ros.process import cores
 from needle_ros.process_pool import processes
 from needle_ros.system_state import CLEAR_STOP
 
@@ -37,7 +37,7 @@ def compare(tick: Tick, fault: str = '') -> Answer:
     if not chosen:
         return [], []
     tick('steered insertions')
-    found = measure_all(chosen, os.cpu_count() or 1)
+    found = measure_all(chosen, cores())
     heads = dict.fromkeys(_place(cell) for cell in chosen)
     sections = [_section(head, chosen, found) for head in heads]
     beyond = [

@@ -8,7 +8,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from math import nan, sqrt
-import os
 from typing import Final, NamedTuple
 
 from benchmarks.calibration import COVERAGE
@@ -17,6 +16,7 @@ from benchmarks.page import Answer, PageSection, Tick
 from needle_dynamics import FloatArray, NeedleParameters, SteeredNeedle, SteeringParameters
 from needle_dynamics.steering.parameters import tissue_of
 from needle_identification import identify_steering, SteeringRecording, SteeringSettings
+from needle_ros.process import cores
 from needle_ros.process_pool import processes
 import numpy as np
 
@@ -301,7 +301,7 @@ def _layers(tick: Tick, pool: Executor, bars: list[Bar], fits: int) -> PageSecti
 def compare(tick: Tick, recordings: int = 1000) -> Answer:
     """Fit simulated insertions, and count intervals that contain the true value."""
     rows, bars = [], []
-    with processes(os.cpu_count() or 1) as pool:
+    with processes(cores()) as pool:
         for k, (name, truth, count) in enumerate(_CASES):
             tick(name)
             fits = max(1, recordings // (1 + 9 * (count > 1) + (truth is None)))

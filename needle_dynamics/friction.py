@@ -13,7 +13,7 @@ from needle_dynamics.compiled.friction import (
     FrictionConstants,
 )
 from needle_ros.errors import ParameterError
-from needle_ros.settings import check_choice
+from needle_ros.settings import check_constants, choice, constant, positive
 import numpy as np
 
 #: Numbers of the friction laws for compiled functions, by name, with the laws of
@@ -97,25 +97,24 @@ class Friction:
     #: ``coulomb``: dry friction mu_s, set-valued at rest. ``stribeck``: decreases from the
     #: break-away value at rest to mu_s, set-valued at rest. ``tanh``: smooth through zero
     #: velocity; a needle at rest creeps. Or the name of an `add_friction_law`.
-    law: str = 'coulomb'
-    coulomb: float  #: Coulomb friction mu_s [N]
-    viscous: float  #: viscous friction mu_v [N s/m]
-    withdrawal: float = 1.0  #: ratio of friction on withdrawal to friction on insertion
-    breakaway: float = 1.0  #: ratio of friction at rest to mu_s (``stribeck``)
-    stribeck_speed: float = 1e-3  #: speed scale of the decrease to mu_s [m/s] (``stribeck``)
-    smoothing_speed: float = 1e-4  #: speed scale of the change of sign [m/s] (``tanh``)
+    law: str = choice('coulomb', LAW_NUMBERS)
+    coulomb: float = constant(0.56, 'N', 'Coulomb friction mu_s')
+    viscous: float = constant(0.3, 'N s/m', 'viscous friction mu_v')
+    withdrawal: float = constant(
+        1.0, '1', 'ratio of friction on withdrawal to friction on insertion'
+    )
+    breakaway: float = constant(
+        1.0, '1', 'ratio of friction at rest to Coulomb friction (law stribeck)', low=1.0
+    )
+    stribeck_speed: float = positive(
+        1e-3, 'm/s', 'speed scale over which break-away friction decays (law stribeck)'
+    )
+    smoothing_speed: float = positive(
+        1e-4, 'm/s', 'speed scale over which friction changes sign (law tanh)'
+    )
 
     def __post_init__(self) -> None:
-        check_choice('law', self.law, LAW_NUMBERS)
-        least = {'coulomb': 0.0, 'viscous': 0.0, 'withdrawal': 0.0, 'breakaway': 1.0}
-        for name, low in least.items():
-            value = getattr(self, name)
-            if not low <= value < inf:
-                raise ParameterError(f'{name} must be finite and >= {low:g}, got {value!r}')
-        for name in ('stribeck_speed', 'smoothing_speed'):
-            value = getattr(self, name)
-            if not 0.0 < value < inf:
-                raise ParameterError(f'{name} must be finite and > 0 m/s, got {value!r}')
+        check_constants(self)
 
     @property
     def constants(self) -> FrictionConstants:

@@ -51,7 +51,13 @@ class NeedlePreset(NamedTuple):
             own = {item.name: values[item.name] for item in fields(part) if item.name in values}
             return from_values(type(part), {**asdict(part), **own})
 
-        return NeedlePreset(replaced(self.needle), replaced(self.steering), self.source)
+        needle = replaced(self.needle)
+        if self.bends and 'torsional_stiffness' not in values:
+            # Both stiffnesses are proportional to the moment of the section and to the modulus.
+            stiffer = needle.bending_stiffness / self.needle.bending_stiffness
+            twist = self.steering.torsional_stiffness * stiffer
+            values = {**values, 'torsional_stiffness': twist}
+        return NeedlePreset(needle, replaced(self.steering), self.source)
 
 
 def tube(outer: float, inner: float = 0.0) -> tuple[float, float]:

@@ -10,7 +10,7 @@ from math import ceil, expm1, inf
 from typing import Any, Final
 
 from needle_dynamics.compiled.tissue import Layers
-from needle_dynamics.friction import Friction, LAW_NUMBERS
+from needle_dynamics.friction import Friction
 from needle_dynamics.modes import ModeShapes
 from needle_ros.errors import ParameterError
 from needle_ros.settings import (
@@ -22,6 +22,7 @@ from needle_ros.settings import (
     from_values,
     number_fields,
     positive,
+    same_field,
 )
 import numpy as np
 
@@ -143,21 +144,13 @@ class NeedleParameters:
     )  # fmt: skip
     swelling_time: float = positive(1.0, 's', 'time constant of the swelling')
     tissue_damping: float = constant(0.0, 'N s/m^2', 'tissue damping c_a per length')
-    coulomb_friction: float = constant(0.56, 'N', 'Coulomb friction mu_s')
-    viscous_friction: float = constant(0.3, 'N s/m', 'viscous friction mu_v')
-    friction_law: str = choice('coulomb', LAW_NUMBERS)
-    withdrawal_friction: float = constant(
-        1.0, '1', 'ratio of friction on withdrawal to friction on insertion'
-    )
-    breakaway_friction: float = constant(
-        1.0, '1', 'ratio of friction at rest to Coulomb friction (law stribeck)', low=1.0
-    )
-    stribeck_speed: float = positive(
-        1e-3, 'm/s', 'speed scale over which break-away friction decays (law stribeck)'
-    )
-    smoothing_speed: float = positive(
-        1e-4, 'm/s', 'speed scale over which friction changes sign (law tanh)'
-    )
+    coulomb_friction: float = same_field(Friction, 'coulomb')
+    viscous_friction: float = same_field(Friction, 'viscous')
+    friction_law: str = same_field(Friction, 'law')
+    withdrawal_friction: float = same_field(Friction, 'withdrawal')
+    breakaway_friction: float = same_field(Friction, 'breakaway')
+    stribeck_speed: float = same_field(Friction, 'stribeck_speed')
+    smoothing_speed: float = same_field(Friction, 'smoothing_speed')
     modes: int = field(default=2, metadata={'description': 'number of shape modes n'})
     formulation: str = choice('complete', FORMULATIONS)
     minimum_depth: float = positive(1e-3, 'm', 'insertion depth below which the model stops')

@@ -6,8 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass
-from math import isfinite, pi
-import os
+from math import pi
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeAlias
@@ -20,6 +19,7 @@ from needle_dynamics.display import Displayed
 from needle_planning.anatomy import Anatomy
 from needle_ros.errors import missing_extra, ParameterError
 from needle_ros.files import read_yaml
+from needle_ros.process import cores
 from needle_ros.process_pool import processes
 from needle_ros.settings import check_whole, is_number
 from needle_study.distribution import from_table
@@ -216,10 +216,10 @@ def chance_of(
 
     """
     check_whole('insertions', insertions, 1, MOST_INSERTIONS)
-    count = (os.cpu_count() or 1) if workers is None else workers
+    count = cores() if workers is None else workers
     check_whole('workers', count, 1, MOST_INSERTIONS)
     check_whole('shafts', shafts, 0, insertions)
-    if not is_number(radius) or not (radius > 0.0 and isfinite(radius)):
+    if not is_number(radius) or radius <= 0.0:
         raise ParameterError(f'radius must be > 0 m, got {radius!r}')
     # Imported here: it imports Numba.
     from needle_planning.plan_scenario import write_inputs

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import inf, isfinite
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from needle_controller.steering.insertion_plan import guide_axes, in_layers, Plan
 from needle_controller.steering.settings import SteeringLimits, step_depths
@@ -57,6 +57,9 @@ class NoPathError(JobError):
     def __init__(self, message: str, bound: float) -> None:
         super().__init__(message)
         self.bound = bound
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return NoPathError, (str(self), self.bound)
 
 
 def find_plan(

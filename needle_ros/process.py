@@ -22,6 +22,13 @@ ONE_THREAD: Final = {'OMP_NUM_THREADS': '1'}
 HIGHEST: Final = 99  #: Highest real-time priority of Linux.
 
 
+def cores() -> int:
+    """Return the number of cores that this process may use, as set by `taskset` or a cluster."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 class DeferredSignals:
     """
     Run the handlers of `ENDINGS` only in `handle` and after the block, of the main thread.

@@ -8,6 +8,7 @@ from builtin_interfaces.msg import Time
 from needle_ros import contract
 from needle_ros.base_node import BaseNode, message_class, profile
 from needle_ros.contract import Topic
+from needle_ros.timing import nanoseconds
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -33,6 +34,12 @@ def request_stamp(node: Node) -> Time:
         node.set_parameters([Parameter('use_sim_time', value=True)])
     stamp: Time = node.get_clock().now().to_msg()
     return stamp
+
+
+def next_stamp(node: Node, before: int) -> int:
+    """Return a stamp [ns] that identifies a request after one: simulated time may stand still."""
+    stamp = nanoseconds(request_stamp(node))
+    return max(stamp, before + 1) if stamp else 0
 
 
 class Publishers:

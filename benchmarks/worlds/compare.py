@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 import json
 from math import nan
-import os
 from pathlib import Path
 import sys
 from typing import cast, Final, NamedTuple
@@ -28,6 +27,7 @@ from needle_controller.steering.laws.multi_hypothesis import OutOfReachError
 from needle_controller.steering.simulation import simulate_steering, SteeringPlant
 from needle_dynamics import FloatArray
 from needle_ros.errors import ParameterError
+from needle_ros.process import cores
 from needle_ros.process_pool import processes
 import numpy as np
 
@@ -228,7 +228,7 @@ def bars(table: Table) -> list[Bar]:
 def compare(tick: Tick, needles: int = 200) -> Answer:
     """Compare the laws in all scenarios, as a part of ``needle bench steering``."""
     count = min(needles, 200)
-    table = measure(list(SCENARIOS), list(LAWS), count, os.cpu_count() or 1, tick)
+    table = measure(list(SCENARIOS), list(LAWS), count, cores(), tick)
     return [section(table, count)], bars(table)
 
 
@@ -238,7 +238,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument('--count', type=int, default=40, help='targets in each world')
     parser.add_argument('--worlds', nargs='+', default=list(SCENARIOS), metavar='WORLD')
     parser.add_argument('--laws', nargs='+', default=list(LAWS), metavar='LAW')
-    parser.add_argument('--jobs', type=int, default=os.cpu_count() or 1, help='processes')
+    parser.add_argument('--jobs', type=int, default=cores(), help='processes')
     parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='write JSON, too')
     options = parser.parse_args(words)
     table = measure(

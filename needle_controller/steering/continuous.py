@@ -109,8 +109,7 @@ class ContinuousInsertion(SteppedInsertion):
         if self.phase is not Phase.INSERTING:
             return super().tip(stamp, tip, now)
         # Insertion depth at the time of the reading.
-        depths, motions = self.law.depths, self._motions
-        depth = float(motions.at[0]) - motions.velocity * (now - stamp) / NANOSECONDS
+        depths, depth = self.law.depths, self._motions.depth_at(stamp)
         at = int(np.searchsorted(depths, depth))
         if 0 < at < len(depths):
             readings = self._passing.setdefault(at, TipMeasurements())

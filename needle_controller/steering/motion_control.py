@@ -74,6 +74,10 @@ class MotionControl:
         if self._before is None or elapsed >= _SPAN:
             self._before = stamp, float(at[0])
 
+    def depth_at(self, stamp: int) -> float:
+        """Return the insertion depth [m] at a time [ns] near the last measurement."""
+        return float(self.at[0]) + self.velocity * (stamp - self._measured) / NANOSECONDS
+
     # Motions.
 
     def send(self, goal: FloatArray, now: int) -> JointMotion | None:

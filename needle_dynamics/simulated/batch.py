@@ -6,7 +6,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from math import ceil, inf
-import os
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray, floats, IntArray
@@ -24,6 +23,7 @@ from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
 from needle_dynamics.simulated.needle_array import columns_of, NeedleArray
 from needle_dynamics.simulated.trajectory import checked_tolerance, count_of, refined
 from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.process import cores
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
@@ -199,7 +199,7 @@ def thread_count(workers: int | None, runs: int) -> int:
     """Return the number of threads of a batch; by default one per core."""
     if workers is not None and (not isinstance(workers, int) or workers < 1):
         raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
-    return min(workers or os.cpu_count() or 1, runs)
+    return min(workers or cores(), runs)
 
 
 def _take(

@@ -212,12 +212,12 @@ class PlantRun:
 
     def _change(self, changes: Mapping[str, Any]) -> bool:
         values = {**self._values, **changes}
-        before, self.constants = self.constants, PlantConstants.of(values)
-        self._values = values
-        if self.constants.model == before.model:
-            return False
-        self.plant.change(self.constants.model)
-        return True
+        constants = PlantConstants.of(values)
+        changes_model = constants.model != self.constants.model
+        if changes_model:
+            self.plant.change(constants.model)
+        self.constants, self._values = constants, values
+        return changes_model
 
     def events(self) -> list[Event]:
         """Return and clear the events since the last call."""

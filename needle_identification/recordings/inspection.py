@@ -87,7 +87,7 @@ class Inspection:
     losses: tuple[str, ...]  #: missing or damaged parts
     words: tuple[str, ...]  #: probable force and motion, with the reason
     command: str  #: for identification; '' if no force and motion were found
-    lacking: str = ''  #: what must be completed in the command
+    lacking: str = ''  #: parts of the command to be completed by the user
 
 
 def inspect_recording(path: Path | str) -> Inspection:
@@ -327,7 +327,7 @@ def _steered(path: Path, signals: Sequence[_Signal]) -> tuple[list[str], str]:
 
 
 def _pressed(path: Path) -> tuple[list[str], str]:
-    """Return words and command for presses; raise `NeedleError` if there are none."""
+    """Return words and command for presses; raise `NeedleError` without presses."""
     recording = reading.read_indentation_recording(path)
     try:
         identify_stiffness(recording)

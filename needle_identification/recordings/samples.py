@@ -77,7 +77,10 @@ class Series:
         self.stamps, self.values, self._weights = stamps, values, weights
 
     def losses(self, name: str) -> list[str]:
-        """Return the repaired and discarded data of the topic `name`."""
+        """Return the repaired, discarded and missing data of the topic `name`."""
+        steps = np.diff(self.stamps)
+        gaps = steps[are_gaps(steps)]
+        places = '1 place' if len(gaps) == 1 else f'{len(gaps)} places'
         return [
             words
             for found, words in (
@@ -85,8 +88,9 @@ class Series:
                 (self.repeated, f'{self.repeated} of {name} with the stamp of another, left out'),
                 (
                     self.width > FINEST,
-                    f'{name} is averaged over {1e-9 * self.width:g} s, because it is very long',
+                    f'averaged {name} over {1e-9 * self.width:g} s, because there are so many',
                 ),
+                (len(gaps), f'pauses of {name} in {places}, {1e-9 * gaps.sum():.3g} s in all'),
             )
             if found
         ]
@@ -347,18 +351,13 @@ class Gathering:
         ):
             if count:
                 bag.losses.append(f'{count} of {name} {what}')
-        bag.losses += series.losses(name)
         # A larger fraction is another robot on the same topic.
         if 0 < self._unwanted < _STRAY * self._messages:
             bag.losses.append(f'{self._unwanted} of {name} name other joints, left out')
         if len(series.stamps) < 2:
             fault = f'must have >= 2 samples at different times, has {len(series.stamps)}'
             self._reject(bag, fault)
-        steps = np.diff(series.stamps)
-        gaps = steps[are_gaps(steps)]
-        if len(gaps):
-            places = '1 place' if len(gaps) == 1 else f'{len(gaps)} places'
-            bag.losses.append(f'{name} pauses in {places}, {1e-9 * gaps.sum():.3g} s in all')
+        bag.losses += series.losses(name)
         bag.losses += [f'{name} {loss}' for loss in self._source.losses()]
         return Samples(name, series.stamps, series.values, np.concatenate(self._latencies))
 

@@ -279,17 +279,9 @@ def sorted_rows(
     series = Series(rows.shape[1])
     series.add(np.rint(1e9 * since).astype(np.int64), rows)
     series.compact()
-    for count, what in (
-        (series.late, 'rows out of order, sorted by time'),
-        (series.repeated, 'rows with the time of another, left out'),
-    ):
-        if count:
-            losses.append(f'{count} {what}')
     if len(series.stamps) < 2:
         raise RecordingError(f'{path}: all rows have the same time')
-    steps = np.diff(series.stamps)
-    if (gaps := steps[are_gaps(steps)]).size:
-        losses.append(f'pauses in {len(gaps)} places, {1e-9 * gaps.sum():.3g} s in all')
+    losses += series.losses('the rows')
     return start, series.stamps, series.values
 
 

@@ -68,7 +68,12 @@ def axis_warnings(
     axes: Sequence[str], time: FloatArray, tip: FloatArray, errors: FloatArray, fit: NoiseFit
 ) -> Iterator[str]:
     """Warn of positions (n, k) on a coarse grid, and of axes whose errors have unlike noise."""
-    steps, k = _steps(tip), len(axes)
+    k, moves = len(axes), np.ptp(tip, axis=0) > EXACT
+    if not moves.all():
+        still = ', '.join(axis for axis, does in zip(axes, moves, strict=True) if not does)
+        yield f'positions along {still} never change: stuck, or not measured'
+        return
+    steps = _steps(tip)
     # The first harmonic of the error of a mean of rounded normal values (Widrow 1996).
     spread = np.maximum(tip.var(axis=0) - steps**2 / 12.0, 0.0)
     off = steps / pi * np.exp(-2.0 * pi**2 * spread / steps**2)

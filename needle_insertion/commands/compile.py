@@ -13,6 +13,7 @@ from needle_dynamics.compiled.cache import is_kept, kernels, prepare, where_kept
 from needle_dynamics.compiled.store import PORTABLE, writable_folder
 from needle_insertion.commands.common import add_flag
 from needle_insertion.progress import ProgressLine
+from needle_ros.process import cores
 from needle_ros.process_pool import processes
 
 #: Modules with kernels, the slowest to compile first.
@@ -65,10 +66,7 @@ def compile_kernels(names: Sequence[str] = MODULES) -> int:
     missing = [name for name in kernels(names) if not is_kept(name)]
     if not missing:
         return 0
-    with (
-        ProgressLine('compiling for this machine') as show,
-        processes(os.cpu_count() or 1) as pool,
-    ):
+    with ProgressLine('compiling for this machine') as show, processes(cores()) as pool:
         show(where_kept())
         futures = [pool.submit(_compile, name) for name in missing]
         for done, future in enumerate(as_completed(futures), 1):

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
-import os
 from pathlib import Path
 import sys
 from typing import Any, Final, TYPE_CHECKING
@@ -17,6 +16,7 @@ from needle_insertion.commands.common import check_folder, print_result
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import table
 from needle_ros.errors import JobError, missing_extra, ParameterError
+from needle_ros.process import cores
 from needle_ros.process_pool import processes
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
     study = read_study(options.study)
     folder = options.output or Path(f'{options.study.stem}_study')
     check_folder(folder)
-    workers = options.workers if options.workers is not None else os.cpu_count() or 1
+    workers = options.workers if options.workers is not None else cores()
     if workers < 1:
         raise ParameterError(f'--workers must be >= 1, got {workers}')
     if options.replay is not None and not 0 <= options.replay < study.samples:

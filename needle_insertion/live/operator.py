@@ -11,10 +11,9 @@ from needle_ros import contract
 from needle_ros.base_node import profile, steady_timer
 from needle_ros.calls_node import Calls
 from needle_ros.errors import printable
-from needle_ros.publishers_node import request_stamp
+from needle_ros.publishers_node import next_stamp, request_stamp
 from needle_ros.requests import no_answer, PendingRequest
 from needle_ros.status import NodeReport
-from needle_ros.timing import nanoseconds
 from rcl_interfaces.srv import SetParameters
 from rclpy.client import Client
 from rclpy.node import Node
@@ -83,9 +82,7 @@ class Operator:
 
     def target(self, x: float, y: float, z: float) -> PendingRequest:
         """Send a target in ``needle_entry`` [m], of which `controller` uses the depth y only."""
-        stamp = nanoseconds(request_stamp(self._node))
-        # A stamp identifies the request: simulated time may stand still.
-        self._stamp = max(stamp, self._stamp + 1) if stamp else 0
+        self._stamp = next_stamp(self._node, self._stamp)
         message = target_message(self._stamp, (x, y, z))
         pending = PendingRequest(contract.TARGET, self._stamp, self.aims)
         self._sending.append((pending, message))

@@ -25,7 +25,7 @@ from needle_ros.contract import Topic
 from needle_ros.errors import JobError, MessageError
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.life_cycle_node import imports, PreparationProgress
-from needle_ros.publishers_node import request_stamp
+from needle_ros.publishers_node import next_stamp
 from needle_ros.requests import PendingRequest
 from needle_ros.run_node import run
 from needle_ros.status import Diagnosis, read_reports, SlicerPhase, SlicerStatus
@@ -90,7 +90,7 @@ class SlicerNode(BaseNode):
         #: Planner, if there are labels; its last transmitted state, and the peer that has it.
         self._planner: SlicerPlanner | None = None
         self._told = '', ''
-        self._shapes = self._targets = 0
+        self._shapes = self._targets = self._stamp = 0
         self._rate = RateCounter()
         #: Unanswered target with its message.
         self._sending: tuple[PendingRequest, PointStamped] | None = None
@@ -268,10 +268,10 @@ class SlicerNode(BaseNode):
             return
         frame, (x, y, z) = newest
         # The clock of the peer is not synchronized.
-        stamp = nanoseconds(request_stamp(self))
-        message = target_message(stamp, (x, y, z))
+        self._stamp = next_stamp(self, self._stamp)
+        message = target_message(self._stamp, (x, y, z))
         self._target.publish(message)
-        self._sending = PendingRequest(contract.TARGET, stamp, _TAKER), message
+        self._sending = PendingRequest(contract.TARGET, self._stamp, _TAKER), message
         self._targets += 1
         subscribers = self._target.get_subscription_count()
         words = ', '.join(f'{MILLIMETERS * one:.2f}' for one in (x, y, z))

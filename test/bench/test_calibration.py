@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from math import nan, pi
-import os
 from typing import Any
 
 from benchmarks import bounds, calibration
@@ -173,7 +172,7 @@ def test_results_are_independent_of_process_count(friction: list[list[Calibratio
 
 
 def test_bars_apply_to_default_cases_with_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, 'cpu_count', lambda: 1)
+    monkeypatch.setattr(calibration, 'cores', lambda: 1)
 
     def study(seed: int, number: int) -> list[CalibrationResult]:
         return [

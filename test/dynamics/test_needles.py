@@ -104,3 +104,18 @@ def test_missing_file_and_unknown_name_are_named() -> None:
         find_needle('none.yaml')
     with pytest.raises(ParameterError, match=r"got 'bending35'; did you mean bending_35mm\?"):
         find_needle('bending35')
+
+
+@pytest.mark.parametrize(
+    'change', [{'outer_diameter': 2e-3}, {'youngs_modulus': 9e10}, {'area_moment': 1e-14}]
+)
+def test_torsional_stiffness_follows_the_bending_stiffness(change: dict[str, float]) -> None:
+    """Their ratio is a property of the material; a given value is used unchanged."""
+    base = NEEDLES['bending_35mm']
+    needle, steering, _ = base.changed(change)
+    ratio = base.needle.bending_stiffness / base.steering.torsional_stiffness
+    assert needle.bending_stiffness != base.needle.bending_stiffness
+    assert needle.bending_stiffness / steering.torsional_stiffness == pytest.approx(ratio)
+    given = base.changed({**change, 'torsional_stiffness': 0.01}).steering
+    assert given.torsional_stiffness == 0.01
+    assert not NEEDLES['phantom'].changed(change).bends

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from needle_dynamics import NeedleModel, NeedleParameters, ParameterError
+from needle_dynamics import InsertionDepthError, NeedleModel, NeedleParameters, ParameterError
 from needle_dynamics.simulated.assembly import PlantConstants
 from needle_dynamics.simulated.commands import AppliedForces
 from needle_dynamics.simulated.plant import Measurement, Plant
@@ -125,6 +125,9 @@ def test_rejected_inputs_are_not_events() -> None:
     for event, error in (
         (Event(TRAJECTORY, {**COURSE.content, 'joints': ['x']}), ParameterError),
         (Event(PARAMETERS, {'model.coulomb_friction': -1.0}), ParameterError),
+        # Deeper than the needle; also if it is requested again.
+        (Event(PARAMETERS, {'model.minimum_depth': 0.15}), InsertionDepthError),
+        (Event(PARAMETERS, {'model.minimum_depth': 0.15}), InsertionDepthError),
         (Event(TARE), JobError),
     ):
         with pytest.raises(error):

@@ -373,7 +373,7 @@ def test_a_missing_chunk_is_reported(tmp_path: Path) -> None:
     loss, *gaps = read_friction_recording(file).losses
     assert loss == 'bag_0.mcap has lost messages; 40 of 60 messages read'
     assert gaps[:2] == [
-        f'{topic} pauses in 1 place, 0.11 s in all' for topic in ('/ft', '/joints')
+        f'pauses of {topic} in 1 place, 0.11 s in all' for topic in ('/ft', '/joints')
     ]
 
 

@@ -246,7 +246,7 @@ def test_a_missing_part_of_a_split_recording_is_reported(
     (folder / 'split_4.mcap').unlink()
     said = identified(folder)
     assert 'split_4.mcap is missing' in said
-    assert f'{FORCE} pauses in 1 place' in said
+    assert f'pauses of {FORCE} in 1 place' in said
 
 
 # Messages.
@@ -400,7 +400,7 @@ def damaged(kind: str) -> tuple[list[tuple[str, str, int, bytes]], str]:
         gone = EPOCH + 2 * SECOND, EPOCH + 5 * SECOND // 2
         return [
             row for row in rows if not gone[0] < row[2] < gone[1]
-        ], f'{FORCE} pauses in 1 place'
+        ], f'pauses of {FORCE} in 1 place'
     if kind == 'lost':
         return [row for row in rows if rng.random() > 0.1], ''
     if kind == 'twice':

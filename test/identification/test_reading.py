@@ -198,7 +198,7 @@ def test_force_without_motion_is_discarded_and_counted(tmp_path: Path) -> None:
     read = read_friction_recording(path)
     # Ten before the motion, thirty in the gap, and its end.
     assert read.losses == (
-        '/joints pauses in 1 place, 0.31 s in all',
+        'pauses of /joints in 1 place, 0.31 s in all',
         '41 of /ft not covered by /joints',
     )
     later = small_bag(tmp_path / 'later', wrenches, [(t + 5000, d, v) for t, d, v in motions])

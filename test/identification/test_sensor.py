@@ -305,8 +305,8 @@ def test_repaired_tables_give_the_same_result(tmp_path: Path) -> None:
     assert identify_sensor(repaired)['noise'].value == identify_sensor(exact)['noise'].value
     for words in (
         '1 rows with a value that is not',
-        '1 rows out of order',
-        '1 rows with the time',
+        '1 of the rows out of order',
+        '1 of the rows with the stamp',
     ):
         assert any(words in loss for loss in repaired.losses)
     # Nine decimal places.
@@ -446,3 +446,12 @@ def test_likelihood_at_very_dense_samples_is_finite() -> None:
     # times.
     size = exp(found.log_noise) * sqrt(1e9)
     assert size * sqrt(2.0 * 1e-3 / 1e3) == pytest.approx(1e-6, rel=0.045)
+
+
+def test_axis_that_never_changes_is_named() -> None:
+    clean = recorded(noise=1e-4, moving=True)
+    tip, truth = clean.tip.copy(), clean.true_tip.copy()
+    tip[:, 1] = tip[0, 1]
+    truth[:, 1] += np.linspace(0.0, 1e-4, len(truth))
+    found = identify_sensor(replace(changed(clean, tip), true_tip=truth))
+    assert 'positions along y never change: stuck, or not measured' in found.warnings

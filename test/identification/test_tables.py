@@ -17,7 +17,7 @@ from needle_identification import (
     read_friction_recording,
     RecordingError,
 )
-from needle_identification.recordings import tables
+from needle_identification.recordings import samples, tables
 from needle_identification.recordings.tables import (
     column_roles,
     guessed,
@@ -236,8 +236,8 @@ def test_unusable_rows_are_counted(tmp_path: Path) -> None:
         '1 lines not readable, left out',
         'columns by their names: time=time, depth=depth, force=force',
         '1 rows with a value that is not a number, left out',
-        '1 rows out of order, sorted by time',
-        '1 rows with the time of another, left out',
+        '1 of the rows out of order, sorted by stamp',
+        '1 of the rows with the stamp of another, left out',
     )
 
 
@@ -368,3 +368,14 @@ def test_columns_of_any_language_are_found_by_their_units(tmp_path: Path, sign: 
     words = f"'time=Zeit [ms],depth={'-' if sign < 0.0 else ''}Achse_mm,force=Kraft [N]'"
     assert found.command == f'needle identify friction {path} --columns {words}'
     assert any('motion reversed' in one for one in found.words) == (sign < 0.0)
+
+
+def test_averaged_rows_of_a_long_table_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(samples, 'MOST_SAMPLES', 1000)
+    time = 0.005 * np.arange(1500)
+    path = written(tmp_path, lines('time,depth,force', time, np.sin(time), np.cos(time)))
+    assert 'averaged the rows over 0.01 s, because there are so many' in (
+        read_friction_recording(path).losses
+    )

@@ -6,8 +6,11 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
+import pickle
 from typing import Any
 
+from hypothesis import given
+from hypothesis import strategies as st
 from needle_controller.steering.free_space import UNITS
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics import find_needle, FloatArray, SteeredNeedle
@@ -555,3 +558,9 @@ def test_synthetic_liver_has_a_plan() -> None:
     assert plan.clearance > 0.0
     assert inserted_clearance(anatomy, plan) >= plan.clearance
     assert anatomy.structures[SKIN].name == 'skin'
+
+
+@given(text=st.text(), bound=st.floats(allow_nan=False))
+def test_error_without_a_path_crosses_processes(text: str, bound: float) -> None:
+    error = pickle.loads(pickle.dumps(NoPathError(text, bound)))  # noqa: S301
+    assert (str(error), error.bound) == (str(NoPathError(text, bound)), bound)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signals that are handled after an event."""
 
+import os
 import signal
 from types import FrameType
 
-from needle_ros.process import DeferredSignals
+from needle_ros.process import cores, DeferredSignals
 import pytest
 
 
@@ -46,3 +47,14 @@ def test_signal_before_the_end_of_the_block_is_handled() -> None:
         assert signal.getsignal(signal.SIGTERM) is before
     finally:
         signal.signal(signal.SIGTERM, previous)
+
+
+@pytest.mark.skipif(not hasattr(os, 'sched_setaffinity'), reason='Linux only')
+def test_cores_are_those_that_the_process_may_use() -> None:
+    before = os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, {min(before)})
+        assert cores() == 1
+    finally:
+        os.sched_setaffinity(0, before)
+    assert cores() == len(before)

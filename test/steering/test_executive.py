@@ -709,3 +709,21 @@ def test_motion_of_rounding_size_is_not_sent() -> None:
         move = motions.send(motions.goal + np.array([0.0, way, 0.0]), robot.now)
         assert (move is not None) == sent
         assert move is None or (np.diff(move.times) > 1e-5).all()
+
+
+@given(
+    speed=st.floats(-0.05, 0.05),
+    age=st.integers(0, 500_000_000),
+    later=st.integers(-500_000_000, 500_000_000),
+)
+def test_depth_of_a_reading_is_by_the_stamps_of_the_measurements(
+    speed: float, age: int, later: int
+) -> None:
+    """At a constant speed it is exact, whatever the age of the measured position."""
+    motions, end = Robot(CONTINUOUS).loop._motions, 2_000_000_000
+    for stamp in (1_000_000_000, end - age):
+        motions.measure(np.array([0.05 + speed * 1e-9 * stamp, 0.0, 0.0]), stamp)
+    # A micrometer in 500 m/s: rounding only.
+    assert motions.depth_at(end + later) == pytest.approx(
+        0.05 + speed * 1e-9 * (end + later), abs=1e-12
+    )

@@ -36,7 +36,7 @@ weight `guide_plan.PATH`.
 
 from collections.abc import Mapping, Sequence
 from math import cos, inf, nan, sin
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from needle_controller.compiled import guide_plan, hypotheses
 from needle_controller.steering.law import (
@@ -78,6 +78,9 @@ class OutOfReachError(JobError):
     def __init__(self, why: str, reach: Reach) -> None:
         super().__init__(why)
         self.reach = reach
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return OutOfReachError, (str(self), self.reach)
 
 
 class MultiHypothesisLaw(SteeringLaw):
