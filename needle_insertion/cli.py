@@ -60,8 +60,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Shell completion request.
         words = os.environ.get('COMP_LINE', '').split()[1:]
     register_error('plain', _plain)
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
+    for output in ('stdout', 'stderr'):
+        if getattr(sys, output) is None:
+            # Closed by the caller, as by `>&-`; else the next opened file would replace it.
+            setattr(sys, output, Path(os.devnull).open('w', encoding='utf-8'))  # noqa: SIM115
+        elif isinstance(stream := getattr(sys, output), TextIOWrapper):
             stream.reconfigure(errors='plain')
     # Imports take up to a second and need no clean-up: a signal ends the process at once.
     previous = {name: signal.signal(name, signal.SIG_DFL) for name in ENDINGS}

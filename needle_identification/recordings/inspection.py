@@ -43,7 +43,7 @@ from needle_identification.steering.reading import (
 )
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_ros import wire
-from needle_ros.contract import INSERTION
+from needle_ros.contract import GROUND_TRUTH, INSERTION, TOPICS
 from needle_ros.errors import NeedleError
 from needle_ros.quantities import AXES
 import numpy as np
@@ -51,6 +51,9 @@ import numpy as np
 _FORCE: Final = (wire.WRENCH,)  # message types of forces
 _VELOCITIES: Final = (wire.TWIST,)  # message types of velocities
 _UNSIGNED: Final = 'the motion does not reverse: the sign of the force cannot be found'
+
+#: Topics of the suite that are computed, not measured: commands, references and the truth.
+_COMPUTED: Final = {one.name for one in TOPICS if one.publisher != 'plant'} | {GROUND_TRUTH.name}
 
 #: Least motion of a steered insertion, by role [m, rad].
 _STEERED: Final = {'guide_x': 2e-4, 'guide_z': 2e-4, 'roll': 0.1}
@@ -345,8 +348,12 @@ def _suggestion(
 
     `components` is the number of axes or joints of each topic, also of those at rest.
     """
-    forces = [one for one in signals if one.topic.type_name in _FORCE]
-    motions = [one for one in signals if one.topic.type_name in reading.MOTIONS]
+    measured = [one for one in signals if one.topic.name.rpartition('/')[2] not in _COMPUTED]
+    forces, motions = (
+        [one for one in measured if one.topic.type_name in types]
+        or [one for one in signals if one.topic.type_name in types]
+        for types in (_FORCE, reading.MOTIONS)
+    )
     pairs = [(force, motion) for force in forces for motion in motions]
     found = [
         (

@@ -278,6 +278,22 @@ def test_shell_completes_commands_options_and_values(line: str, offered: list[st
     assert asked.stdout.split() == offered
 
 
+@pytest.mark.parametrize(('closed', 'other'), [('1', 'stderr'), ('2', 'stdout')])
+def test_closed_stream_has_no_effect_on_the_other(closed: str, other: str, tmp_path: Path) -> None:
+    """As of a program that is started without a terminal; files are complete."""
+    file = tmp_path / 'run.csv'
+    line = f'exec "$0" -m needle_insertion.cli simulate -o "$1" {closed}>&-'
+    done = subprocess.run(
+        ['/bin/sh', '-c', line, sys.executable, str(file)],
+        capture_output=True, text=True, timeout=300.0, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    said = {'stdout': done.stdout, 'stderr': done.stderr}
+    assert ('wrote' in said['stdout']) == (other == 'stdout')
+    assert 'Traceback' not in said['stderr']
+    assert file.read_text('utf-8').count('\n') > 100
+
+
 def test_terminal_without_unicode_shows_a_result() -> None:
     """Unsupported characters are replaced."""
     done = run('identify', 'friction', BAGS[0], PYTHONIOENCODING='ascii')

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import get_typestore, Stores
-from support.samples import EPOCH, header, STORE, wrench
+from support.samples import EPOCH, header, joint_states, STORE, wrench
 from support.steered_recording import recorded_plant
 from support.strokes import strokes
 
@@ -195,6 +195,27 @@ def test_the_suggested_command_for_a_shipped_bag_succeeds(
     # Samples of the simulated robot are equidistant.
     assert rates['/base_wrench'] == pytest.approx(rate, rel=1e-3)
     capsys.readouterr()
+
+
+def test_commands_and_the_truth_are_not_measurements(tmp_path: Path) -> None:
+    """Also if they explain each other better; without measurements they are used."""
+    made, rng = strokes(seed=1, push=0.0), np.random.default_rng(2)
+    noisy = made.force + rng.normal(scale=0.05, size=len(made.force))
+    truth = ('/a/wrench_command', made.force), ('/a/ground_truth', made.depth)
+    measured = ('/a/base_wrench', noisy), ('/a/joint_states', made.depth)
+    for name, topics in (('own', (*truth, *measured)), ('truth', truth)):
+        path = tmp_path / name
+        with BagWriter(path) as bag:
+            for topic, values in topics:
+                is_force = 'wrench' in topic
+                bag.add_topic(topic, WRENCH if is_force else JOINTS)
+                for time, value in zip(made.time, values, strict=True):
+                    stamp = EPOCH + round(1e9 * time)
+                    one = wrench(stamp, value) if is_force else joint_states(stamp, value, None)
+                    bag.write(topic, one, stamp)
+        chosen = measured if name == 'own' else truth
+        words = inspect_recording(path).words[0]
+        assert all(topic in words for topic, _ in chosen), words
 
 
 def test_force_and_motion_are_selected_among_signals(
