@@ -69,6 +69,14 @@ def read_yaml(path: Path | str) -> Any:
         raise ParameterError(f'{path} {error}') from error
 
 
+def read_value(text: str) -> Any:
+    """Parse one value in YAML, as of a command line."""
+    try:
+        return read_document(text)
+    except DocumentError as error:
+        raise ParameterError(f'{text!r} is not a value in YAML') from error
+
+
 def read_document(text: str) -> Any:
     """Parse a YAML document of an external author; aliases could expand beyond the memory."""
     if len(text) > LARGEST:

@@ -61,6 +61,17 @@ def quantities(text: str, unit: str) -> list[float]:
     return [quantity(word, unit) for word in re.split(r' *, *| +(?=[-+.\d])', text.strip())]
 
 
+def point(text: str, requirement: str) -> list[float]:
+    """Return three lengths [m] from text; ``requirement`` begins the error of other text."""
+    try:
+        found = quantities(text, 'm')
+    except ParameterError:
+        found = []
+    if len(found) != len(AXES) or not all(map(isfinite, found)):
+        raise ParameterError(f'{requirement}, got {text!r}')
+    return found
+
+
 def target(text: str) -> tuple[float, float, float]:
     """Return x, y, z of a target of the tip [m], from three lengths or from the depth y alone."""
     found = quantities(text, 'm')

@@ -129,16 +129,16 @@ def add_constants(parser: ArgumentParser, option: str, meaning: str) -> None:
 
 
 def constants(words: Sequence[str], option: str = '--set') -> dict[str, Any]:
-    """Parse ``name=value`` words into values by name; a value is JSON or a plain word."""
+    """Parse ``name=value`` words into values by name; a value is YAML, as in a needle file."""
+    # Imported here: the help does not need it.
+    from needle_ros.files import read_value
+
     values: dict[str, Any] = {}
     for word in words:
         name, sign, text = word.partition('=')
         if not sign:
             raise ParameterError(f'{option} takes NAME=VALUE, got {word!r}')
-        try:
-            values[name] = json.loads(text)
-        except json.JSONDecodeError:
-            values[name] = text
+        values[name] = read_value(text)
     return values
 
 

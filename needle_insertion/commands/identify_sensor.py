@@ -2,7 +2,6 @@
 """`needle identify sensor`: noise, bias, delay and losses of a tip sensor."""
 
 import argparse
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from needle_insertion.report.content import table
 from needle_insertion.report.identify_text import interval_of, title_of
 from needle_ros.errors import ParameterError
 from needle_ros.files import write_whole
-from needle_ros.quantities import AXES, quantities
+from needle_ros.quantities import AXES, point
 
 
 def add_sensor(what: Any) -> None:
@@ -69,16 +68,8 @@ def _truth(options: argparse.Namespace) -> Path | list[float]:
         return Path(options.log)
     if Path(options.truth).exists():
         return Path(options.truth)
-    try:
-        found = quantities(options.truth, 'm')
-    except ParameterError:
-        found = []
-    if len(found) != len(AXES) or not all(map(isfinite, found)):
-        raise ParameterError(
-            f'--truth must be a file, or three lengths x,y,z such as 0mm,52.3mm,0mm, got '
-            f'{options.truth!r}'
-        )
-    return found
+    what = '--truth must be a file, or three lengths x,y,z such as 0mm,52.3mm,0mm'
+    return point(options.truth, what)
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from functools import partial
-from math import isfinite
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Final, TYPE_CHECKING
@@ -21,7 +20,7 @@ from needle_planning.anatomy import beside
 from needle_planning.paths import SKIN_LIMIT
 from needle_planning.planner import find_plan, RESOLUTION
 from needle_ros.errors import ParameterError
-from needle_ros.quantities import quantities
+from needle_ros.quantities import point
 from needle_ros.settings import check_whole, LARGEST_SEED
 import numpy as np
 
@@ -219,10 +218,7 @@ def _simulation(options: argparse.Namespace) -> Callable[..., Chance] | None:
 
 
 def _position(name: str, text: str) -> list[float]:
-    found = quantities(text, 'm')
-    if len(found) != 3 or not all(map(isfinite, found)):
-        raise ParameterError(f'{name} must be R,A,S, such as 40mm,-12mm,105mm, got {text!r}')
-    return found
+    return point(text, f'{name} must be R,A,S, such as 40mm,-12mm,105mm')
 
 
 def _entry(text: str | None) -> str | list[float] | None:

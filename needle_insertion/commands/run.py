@@ -127,13 +127,10 @@ def _nodes(options: argparse.Namespace, *, steers: bool) -> dict[str, dict[str, 
 
 def _parameter(word: str) -> tuple[str, str, Any]:
     # Imported here: the help does not need it.
-    from needle_ros.files import DocumentError, read_document
+    from needle_ros.files import read_value
 
     name, sign, text = word.partition('=')
     node, dot, name = name.partition('.')
     if not (sign and dot and name and text):
         raise ParameterError(f'-p takes NODE.NAME=VALUE, got {word!r}')
-    try:
-        return node, name, read_document(text)
-    except DocumentError as error:
-        raise ParameterError(f'-p {word}: {text!r} is not a value in YAML') from error
+    return node, name, read_value(text)

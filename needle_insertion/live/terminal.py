@@ -22,7 +22,7 @@ from needle_insertion.live.screen import Screen
 from needle_insertion.report.content import table
 from needle_ros.contract import JOINT_STATES, TIP_DEFLECTION
 from needle_ros.errors import JobError, ParameterError
-from needle_ros.files import DocumentError, read_document
+from needle_ros.files import read_value
 from needle_ros.quantities import quantity, target, TARGET_HELP
 from needle_ros.status import (
     CommissioningPhase,
@@ -307,10 +307,7 @@ class Terminal(Cmd):
         if len(words) != 3:
             raise _unfit('set', words)
         node, name, text = words
-        try:
-            value = read_document(text)
-        except DocumentError as error:
-            raise ParameterError(f'{text!r} is not a value in YAML') from error
+        value = read_value(text)
         if isinstance(value, dict) or value is None:
             raise ParameterError(f'{text!r} is not a value of a parameter')
         self._answered(self._operator.set(node, name, value), f'{node} {name} = {text}')
