@@ -45,7 +45,12 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import find_needle
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import inserted_shape, SteeredNeedle
-from needle_dynamics.steering.parameters import SteeringParameters, with_layers, with_lengths
+from needle_dynamics.steering.parameters import (
+    SteeringParameters,
+    with_bevel,
+    with_layers,
+    with_lengths,
+)
 from needle_planning.anatomy import Anatomy, Structure
 from needle_planning.certificate import least_clearances, sag_of
 from needle_planning.clearance import Clearance
@@ -318,16 +323,12 @@ class PlanScenario(Scenario):
         needle, steering = with_lengths(inputs.needle, inputs.steering, *lengths)
         if count := len(inputs.plan.layers):
             needle = with_layers(needle, [row[name] for name in LAYERS[:count]])
-        roll, loads = inputs.plan.roll, inputs.steering.bevel_load
-        nominal = max(loads)
+        roll, nominal = inputs.plan.roll, max(inputs.steering.bevel_load)
         x = nominal * sin(roll) + row['bevel_x']
         z = nominal * cos(roll) + row['bevel_z']
         size = hypot(x, z)
-        # A bevel differs in all layers by the same factor.
-        loads = tuple(size / nominal * one for one in loads) if nominal else (size,)
         steering = replace(
-            steering,
-            bevel_load=loads,
+            with_bevel(steering, size),
             path_noise=row['path_noise'],
             path_noise_length=self._prior.path_noise_length,
         )

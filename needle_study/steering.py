@@ -13,7 +13,7 @@ from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, Ste
 from needle_controller.steering.settings import SIMULATION_LIMITS, SteeringLimits, step_depths
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch
 from needle_dynamics.simulated.tip_sensor import TipErrorParameters
-from needle_dynamics.steering.parameters import with_lengths
+from needle_dynamics.steering.parameters import with_bevel, with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values, same_field
@@ -30,6 +30,7 @@ _JOINTS: Final = contract.steered_states(efforts=False)
 _EXACT: Final = simulation.SteppedTipErrors()  # of a sensor with white noise alone
 _SEEDS: Final = 2**63  #: upper bound of the seeds of paths
 _SHORTEST: Final = 1e-6  # lower bound of times and lengths of errors [s, m]
+_OF_BEVEL: Final = 'load of the bevel where it is largest; in other layers in proportion'
 _AT_ONCE: Final = 256  #: insertions per batch, which are in memory together
 _PARTS: Final = ('needle', 'constants', 'prior', 'law')  #: settings that are mappings or words
 
@@ -127,8 +128,8 @@ class SteeringScenario(Scenario):
             ),
             'tilt_x': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
             'tilt_z': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
-            'bevel_x': Variable(0.0, 'N', 'load of the bevel', -1e3, 1e3),
-            'bevel_z': Variable(bevel, 'N', 'load of the bevel', -1e3, 1e3),
+            'bevel_x': Variable(0.0, 'N', _OF_BEVEL, -1e3, 1e3),
+            'bevel_z': Variable(bevel, 'N', _OF_BEVEL, -1e3, 1e3),
             'frame_x': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
             'frame_z': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
             'path_noise': Variable(noise, 'rad^2/m', 'variance of the direction of the path', 0.0),
@@ -157,8 +158,7 @@ class SteeringScenario(Scenario):
         needle, steering = with_lengths(self._needle, self._steering, *lengths)
         bevel = np.array([row['bevel_x'], row['bevel_z']])
         steering = replace(
-            steering,
-            bevel_load=(float(np.hypot(*bevel)),),
+            with_bevel(steering, float(np.hypot(*bevel))),
             path_noise=row['path_noise'],
             path_noise_length=self._prior.path_noise_length,
         )

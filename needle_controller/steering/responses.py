@@ -45,6 +45,7 @@ from needle_dynamics.steering.parameters import (
     longest_element,
     SteeringParameters,
     turning_load,
+    with_bevel,
     with_lengths,
 )
 from needle_ros.errors import ParameterError
@@ -146,8 +147,7 @@ class SteeringModel:
         grid_lengths, grid_skins = (one.ravel() for one in np.meshgrid(lengths, skins))
         spreads = _layer_spreads(b, needle.tissue.starts, float(at[-1]))
         # The responses are per load in the layer with the largest load of the bevel.
-        loads = tuple(one / most for one in steering.bevel_load) if most else (1.0,)
-        unit = replace(steering, element=_ELEMENT, bevel_load=loads, path_noise=0.0)
+        unit = replace(with_bevel(steering, 1.0), element=_ELEMENT, path_noise=0.0)
         shortest = with_lengths(needle, unit, float(lengths[0]))
         rows = _Rows(at, needle.tissue.starts, longest_element(*shortest), together)
         arcs = [(lead, windup) for lead in _LEADS for windup in _WINDUPS if width and most]

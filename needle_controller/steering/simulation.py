@@ -15,7 +15,13 @@ from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.tip_sensor import TipErrorParameters, TipErrors
 from needle_dynamics.steering.needle import SteeredNeedle
-from needle_dynamics.steering.parameters import SteeringParameters, with_lengths
+from needle_dynamics.steering.parameters import (
+    by_layer,
+    SteeringParameters,
+    with_bevel,
+    with_layers,
+    with_lengths,
+)
 from needle_ros.settings import constant
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,14 +54,22 @@ def sample_truth(
     rng: np.random.Generator,
     seed: int,
 ) -> GroundTruth:
-    """Sample a true needle: uniform in the spread of the prior, normal in its deviations."""
+    """
+    Sample a true needle: uniform in the spread of the prior, normal in its deviations.
+
+    The factors of the layers are log-normal; the load of the bevel is that of the layer with the
+    largest nominal load.
+    """
     length, skin = (1.0 + prior.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
     sizes = prior.tilt, prior.frame, prior.bevel
     tilt, frame, bevel = (size * rng.standard_normal(2) for size in sizes)
     needle, steering = with_lengths(needle, steering, length, skin)
+    if prior.layer_spread:
+        layers = len(needle.tissue.starts)
+        spreads = by_layer('prior.layer_spread', prior.layer_spread, layers)
+        needle = with_layers(needle, np.exp(spreads * rng.standard_normal(layers)).tolist())
     steering = replace(
-        steering,
-        bevel_load=(hypot(*bevel),),
+        with_bevel(steering, hypot(*bevel)),
         path_noise=prior.path_noise,
         path_noise_length=prior.path_noise_length,
     )

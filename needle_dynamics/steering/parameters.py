@@ -139,6 +139,28 @@ def with_layers(needle: NeedleParameters, factors: Sequence[float]) -> NeedlePar
     return replace(needle, tissue_stiffness=first, layer_stiffnesses=tuple(others))
 
 
+def with_bevel(steering: SteeringParameters, load: float) -> SteeringParameters:
+    """
+    Scale the load of the bevel in all layers by the same factor.
+
+    Parameters
+    ----------
+    steering : SteeringParameters
+        Constants with one load of the bevel, or one for each layer.
+    load : float
+        New load in the layer with the largest one [N]; in all layers, if the loads are 0.
+
+    Returns
+    -------
+    SteeringParameters
+        Constants with the new loads.
+
+    """
+    most = max(steering.bevel_load)
+    parts = tuple(one / most for one in steering.bevel_load) if most else (1.0,)
+    return replace(steering, bevel_load=tuple(load * part for part in parts))
+
+
 def by_layer(name: str, values: tuple[float, ...], layers: int) -> FloatArray:
     """Return a constant as one value per layer, shape (layers,); errors contain ``name``."""
     if len(values) not in (1, layers):

@@ -16,7 +16,7 @@ from needle_controller.steering.settings import step_depths
 import needle_dynamics as dynamics
 from needle_dynamics.needles import DIAMETERS, NeedlePreset
 from needle_dynamics.steering.needle import NeedlePath, NeedleShape
-from needle_dynamics.steering.parameters import bending_length
+from needle_dynamics.steering.parameters import bending_length, with_bevel
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import png, table
@@ -129,8 +129,9 @@ def sample_needle(
         needle, steering, replace(prior, **nearer), np.random.default_rng(seed), seed
     )
     bevel = found.bevel + np.array([0.0, max(steering.bevel_load)])
-    load = float(np.hypot(*bevel))
-    return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=(load,)))
+    # Not of the sampled loads, which may be 0 in all layers.
+    loads = with_bevel(steering, float(np.hypot(*bevel))).bevel_load
+    return replace(found, bevel=bevel, steering=replace(found.steering, bevel_load=loads))
 
 
 def run(options: argparse.Namespace) -> int:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from math import atan2, hypot, sqrt
+from math import atan2, exp, hypot, sqrt
 from typing import Any, Final, NamedTuple, TYPE_CHECKING
 
 from needle_dynamics.arrays import Array3, BoolVector, FloatArray, IntVector, Matrix, Vector
@@ -42,9 +42,13 @@ CAUSES: Final = 3
 class Population(NamedTuple):
     """Distribution of needles and targets, as in `sample_truth`."""
 
-    nominal: Steered  #: nominal constants, with the largest length of an element
+    #: Nominal constants, with the largest length of an element, and the loads of the bevel per
+    #: load in the layer with the largest one.
+    nominal: Steered
     free: float  #: free length [m]
     spread: float  #: relative uncertainty of the bending length and the skin
+    #: Standard deviation of the logarithm of the stiffness of each layer, shape (layers,) or (0,).
+    layers: Vector
     #: Standard deviations of tilt [rad], rotation of the sensor [rad] and bevel load [N].
     tilt: float
     frame: float
@@ -105,16 +109,17 @@ def _sample(a: SteeredNeedles, k: int, uniform: FloatArray, normal: FloatArray) 
     skin = n.skin * stiffer * (1.0 + p.spread * (2.0 * uniform[1] - 1.0))
     bevel_x, bevel_z = p.bevel * normal[2, 0], p.bevel * normal[2, 1]
     layers, constants = a.layers[k], a.constants[k]
-    element = n.element
+    element, measured = n.element, CAUSES + len(a.depths)
+    wander = a.wander[k]
     for i in range(layers.shape[1]):
         layers[0, i], layers[1, i] = n.starts[i], n.stiffness[i] * stiffer
-        layers[2, i] = hypot(bevel_x, bevel_z)
+        if len(p.layers) > 0:
+            layers[1, i] *= exp(p.layers[i] * normal[measured + len(wander) + i, 0])
+        layers[2, i] = hypot(bevel_x, bevel_z) * n.bevel[i]
         if layers[1, i] > 0.0:
             element = min(element, _bending_length(n.ei, layers[1, i]))
     constants[0], constants[1], constants[2] = n.ei, element, skin
     constants[3], constants[4], constants[5] = n.twist, n.turning, n.length
-    measured = CAUSES + len(a.depths)
-    wander = a.wander[k]
     size = 1.0
     for i in range(len(wander)):
         for plane in range(2):
@@ -146,7 +151,8 @@ def sample(
     Sample the needles of the mask `which` and their targets, and place them on the skin.
 
     ``uniform``, shape (n, 4), is in [0, 1): bending length, skin, target in x and z. ``normal``,
-    shape (n, rows, 2), has rows of tilt, frame and bevel, of each measurement, and of the path.
+    shape (n, rows, 2), has rows of tilt, frame and bevel, of each measurement, of the path, and,
+    if the population has a spread for layers, of each layer.
     """
     for k in range(len(which)):
         if which[k]:

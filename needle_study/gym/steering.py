@@ -24,6 +24,7 @@ from needle_dynamics.compiled.boxed import Boxed
 from needle_dynamics.compiled.cutting_lanes import DEPTH, ROWS
 from needle_dynamics.compiled.lane_rows import LANES
 from needle_dynamics.steering.needle import empty_cut, steered, wandering
+from needle_dynamics.steering.parameters import by_layer, with_bevel
 from needle_ros.errors import ParameterError
 from needle_study.gym.environment import NeedleEnv, NeedleVectorEnv, picture
 from needle_study.gym.pushed import BOUND
@@ -77,14 +78,19 @@ class _Needles:
 
     def _allocate(self, needle: NeedleParameters, steering: SteeringParameters) -> None:
         """Allocate needles like this one; it is the nominal one of the population."""
-        nominal, n, prior = steered(needle, steering), self._number, self._prior
+        nominal = steered(needle, with_bevel(steering, 1.0))
+        n, prior = self._number, self._prior
         depth, layers, points = self._depths[-1], len(nominal.starts), len(self._depths)
         cells = ceil(depth / nominal.cell) + 2
+        self._replaced, spreads = needle is not self._needle, np.zeros(0)
+        if prior.layer_spread and not self._replaced:
+            spreads = by_layer('prior.layer_spread', prior.layer_spread, layers)
         self._needles = SteeredNeedles(
             population=Population(
                 nominal=nominal._replace(element=min(steering.element, nominal.cell)),
                 free=steering.free_length,
                 spread=prior.spread,
+                layers=spreads,
                 tilt=prior.tilt,
                 frame=prior.frame,
                 bevel=prior.bevel,
@@ -106,8 +112,8 @@ class _Needles:
             steps=np.zeros(n, dtype=np.int64),
         )
         self._boxed = Boxed(self._needles)
-        self._uniform, self._normal = np.zeros((n, 4)), np.zeros((n, CAUSES + points + cells, 2))
-        self._replaced = needle is not self._needle
+        rows = CAUSES + points + cells + len(spreads)
+        self._uniform, self._normal = np.zeros((n, 4)), np.zeros((n, rows, 2))
 
     def begin(
         self, which: BoolArray, rngs: Sequence[np.random.Generator], options: Mapping[str, Any]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from benchmarks.episodes import Maker, Policy, ready, SteeringPolicy, total_rewards
@@ -25,7 +26,7 @@ from needle_dynamics import (
 from needle_dynamics.compiled.lane_rows import LANES
 from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.steering.needle import wandering
-from needle_dynamics.steering.parameters import with_lengths
+from needle_dynamics.steering.parameters import with_layers, with_lengths
 from needle_ros.errors import NeedleError, ParameterError, ShapeError
 from needle_study.gym.insertion import DRAWN, InsertionEnv, InsertionVectorEnv, SPREAD, TARGETS
 from needle_study.gym.pushed import FORCE, PERIOD, START, STEP
@@ -97,22 +98,28 @@ def test_needles_in_other_lanes_do_not_matter() -> None:
         assert k < 3 or (found[late, 0] != expected[late, 0]).all()
 
 
-def sampled_truth(prior: SteeringPrior, seed: int) -> tuple[GroundTruth, FloatArray, FloatArray]:
+def sampled_truth(
+    prior: SteeringPrior, seed: int, name: str = DEFAULT_NEEDLE
+) -> tuple[GroundTruth, FloatArray, FloatArray]:
     """Return needle, target and normal numbers of the first episode of `SteeringEnv`."""
     rng, _ = gymnasium.utils.seeding.np_random(seed)
-    nominal, steering, _ = find_needle(DEFAULT_NEEDLE)
+    nominal, steering, _ = find_needle(name)
     length, skin, *aside = rng.uniform(-1.0, 1.0, 4).tolist()
-    # 3 causes, 21 measurements, and loads of the path up to the cell after the target depth.
-    normal = rng.standard_normal((3 + 21 + 102, 2))
+    # 3 causes, 21 measurements, loads of the path up to the cell after the target depth, layers.
+    normal = rng.standard_normal((3 + 21 + 102 + len(prior.layer_spread), 2))
     needle, steering = with_lengths(
         nominal, steering, 1.0 + prior.spread * length, 1.0 + prior.spread * skin
     )
+    if prior.layer_spread:
+        needle = with_layers(needle, np.exp(np.array(prior.layer_spread) * normal[126:, 0]))
     tilt, frame, bevel = (
         size * row
         for size, row in zip((prior.tilt, prior.frame, prior.bevel), normal, strict=False)
     )
+    most = max(steering.bevel_load)
+    loads = np.array(steering.bevel_load) / most if most else np.ones(1)
     steering = replace(
-        steering, bevel_load=(float(np.hypot(*bevel)),), path_noise=0.0,
+        steering, bevel_load=tuple((np.hypot(*bevel) * loads).tolist()), path_noise=0.0,
         path_noise_length=prior.path_noise_length,
     )  # fmt: skip
     x, z = tilt.tolist()
@@ -122,12 +129,18 @@ def sampled_truth(prior: SteeringPrior, seed: int) -> tuple[GroundTruth, FloatAr
     return truth, 4e-3 * np.array(aside), normal[3:]
 
 
-@pytest.mark.parametrize('kind', ['sampled', 'given', 'layers'])
-def test_steering_environment_equals_the_simulated_needle(kind: str) -> None:
+@pytest.mark.parametrize('kind', ['sampled', 'nominal layers', 'given', 'layers'])
+def test_steering_environment_equals_the_simulated_needle(tmp_path: Path, kind: str) -> None:
     """Layers have other bevels, and borders that are not depths of steps."""
     # The path noise of a sampled needle is negligible.
-    prior = replace(PRIOR, path_noise=1e-300)
-    truth, target, normal = sampled_truth(prior, 4)
+    prior, name = replace(PRIOR, path_noise=1e-300), DEFAULT_NEEDLE
+    if kind == 'nominal layers':
+        prior, name = replace(prior, layer_spread=(0.3, 0.5, 0.0)), str(tmp_path / 'needle.yaml')
+        Path(name).write_text(
+            'bevel_load: [0.1, 0.4, 0.0]\nlayer_depths: [0.0123, 0.05]\n'
+            'layer_stiffnesses: [2.0e+4, 3.0e+5]\n'
+        )
+    truth, target, normal = sampled_truth(prior, 4, name)
     if kind == 'layers':
         truth = replace(
             truth,
@@ -137,8 +150,9 @@ def test_steering_environment_equals_the_simulated_needle(kind: str) -> None:
             steering=replace(truth.steering, bevel_load=(0.1, 0.4, 0.0), path_noise=1e-4),
             seed=7,
         )
-    environment = SteeringEnv(prior=prior)
-    options = None if kind == 'sampled' else {'truth': truth, 'target': target}
+    environment = SteeringEnv(name, prior=prior)
+    given = {'truth': truth, 'target': target}
+    options = given if kind in {'given', 'layers'} else None
     seen, info = environment.reset(seed=4, options=options)
     plant, limit = truth.plant(step_depths(0.1, 5e-3)), SIMULATION_LIMITS.guide_limit
     rng = np.random.default_rng(1)

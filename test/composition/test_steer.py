@@ -168,6 +168,19 @@ def test_needle_is_drawn_in_the_frame_of_target_and_sensor() -> None:
     assert drawn[-1] == pytest.approx([plant.tip[0], 0.1, plant.tip[1]], abs=1e-9)
 
 
+def test_sampled_needle_has_the_nominal_bevel_of_each_layer() -> None:
+    """Its deviation scales all layers, also where it is 0."""
+    needle, steering, _ = find_needle(DEFAULT_NEEDLE).changed(
+        {'bevel_load': [0.3, 0.1], 'layer_depths': [0.03], 'layer_stiffnesses': [3e4]}
+    )
+    exact = steer.sample_needle(needle, steering, SteeringPrior(bevel=0.0), 1)
+    assert exact.steering.bevel_load == (0.3, 0.1)
+    truth = steer.sample_needle(needle, steering, SteeringPrior(), 1)
+    size = float(np.hypot(*truth.bevel))
+    assert size != 0.3
+    assert truth.steering.bevel_load == pytest.approx((size, size / 3.0))
+
+
 def test_shipped_picture_is_the_picture_of_the_default_command(tmp_path: Path) -> None:
     """Of the command in the README."""
     assert main(['steer', '--target', '4mm,100mm,-2mm', '-o', str(tmp_path / 'now.png')]) == 0

@@ -21,7 +21,8 @@ from typing import Any
 from benchmarks.kills import kill_again_and_again, kill_workers
 from hypothesis import given
 from hypothesis import strategies as st
-from needle_dynamics import FloatArray
+from needle_controller.steering.settings import step_depths
+from needle_dynamics import DEFAULT_NEEDLE, find_needle, FloatArray, insert_batch
 from needle_identification.bags.bag import read_topic
 from needle_insertion.cli import main
 from needle_insertion.commands import study as study_command
@@ -588,6 +589,18 @@ def test_open_loop_equals_a_guide_at_rest(tmp_path: Path) -> None:
     # A guide at position 0 and a missing guide differ by rounding.
     np.testing.assert_allclose(rows['tip_x'], same['tip_x'], rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(rows['tip_z'], same['tip_z'], rtol=0.0, atol=1e-9)
+
+
+def test_sampled_needle_has_the_bevel_of_each_layer() -> None:
+    """Without population, open loop equals an insertion with the nominal constants."""
+    constants = {'bevel_load': [0.3, 0.0], 'layer_depths': [0.03], 'layer_stiffnesses': [2e4]}
+    settings = {'depth': 0.1, 'step_length': 0.01, 'law': 'open_loop', 'constants': constants}
+    study = build_study(
+        {'scenario': 'steering', 'settings': settings, 'population': {'path_noise': 0.0}}
+    )
+    needle, steering, _ = find_needle(DEFAULT_NEEDLE).changed(constants)
+    tip = insert_batch([needle], [steering], step_depths(0.1, 0.01), workers=1)[0, -1]
+    assert study.rows(0, 1)['tip_z'][0] == pytest.approx(tip[2], rel=1e-9)
 
 
 def test_intervals_have_their_nominal_coverage() -> None:

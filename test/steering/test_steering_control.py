@@ -38,7 +38,6 @@ from needle_dynamics import (
     SteeredNeedle,
     SteeringParameters,
 )
-from needle_dynamics.steering.parameters import with_layers
 from needle_ros.errors import JobError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -203,6 +202,29 @@ class Moved(MultiHypothesisLaw):
         return complex(*self.positions[self.step // 5])
 
 
+def test_sampled_needles_have_the_bevel_and_the_spread_of_each_layer() -> None:
+    """In proportion to the nominal loads; without a spread, all layers have the same factor."""
+    nominal = NEEDLE.tissue_stiffness
+    needle = replace(NEEDLE, layer_depths=(0.03,), layer_stiffnesses=(2.0 * nominal,))
+    steering, logs = replace(STEERING, bevel_load=(0.3, 0.1)), list[FloatArray]()
+    for seed in range(200):
+        priors = SteeringPrior(), SteeringPrior(layer_spread=(0.2, 0.5))
+        same, apart = (
+            sample_truth(needle, steering, one, np.random.default_rng(seed), seed)
+            for one in priors
+        )
+        stiffnesses = np.array([one.needle.tissue.stiffnesses for one in (same, apart)])
+        assert stiffnesses[0, 1] == 2.0 * stiffnesses[0, 0]
+        logs.append(np.diff(np.log(stiffnesses), axis=0)[0])
+        for one in (same, apart):
+            size = float(np.hypot(*one.bevel))
+            assert one.steering.bevel_load == pytest.approx((size, size / 3.0))
+            assert one.steering.skin_stiffness == same.steering.skin_stiffness
+            assert one.tilt == same.tilt
+    # Four standard errors, each 1/sqrt(2 * 200).
+    np.testing.assert_allclose(np.std(logs, axis=0), [0.2, 0.5], rtol=4.0 / 20.0)
+
+
 def test_forecasts_hold_in_layers_that_differ_independently() -> None:
     """Four layers with deviations of 30 % each: 95 % of the ends are in the forecast."""
     needle = replace(
@@ -211,14 +233,11 @@ def test_forecasts_hold_in_layers_that_differ_independently() -> None:
     priors = {(): SteeringPrior(), (0.3,): SteeringPrior(layer_spread=(0.3,))}
     models = {one: SteeringModel(needle, STEERING, DEPTHS, priors[one]) for one in priors}
     held = dict.fromkeys(models, 0)
-    true = SteeringPrior(spread=0.0, tilt=0.02, frame=0.03, bevel=0.1)
+    true = SteeringPrior(spread=0.0, layer_spread=(0.3,), tilt=0.02, frame=0.03, bevel=0.1)
     count, last = 120, len(DEPTHS) - 1
     for seed in range(count):
         rng = np.random.default_rng(seed)
-        truth = replace(
-            sample_truth(needle, STEERING, true, rng, seed),
-            needle=with_layers(needle, np.exp(0.3 * rng.standard_normal(4)).tolist()),
-        )
+        truth = sample_truth(needle, STEERING, true, rng, seed)
         positions = rng.uniform(-5e-3, 5e-3, (4, 2))
         for one, model in models.items():
             law = Moved(model, (0.0, 0.0), LIMITS)
