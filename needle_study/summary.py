@@ -181,7 +181,8 @@ def indices(
 
     The groups of a design `saltelli` also have the index of the noise, total indices, and for all
     variables of a table one index, by its name. For other designs the samples are grouped by each
-    variable. The intervals are of the jackknife over the replicates, or over as many parts.
+    variable. The intervals are of the jackknife over the replicates, or over as many parts; they
+    are [0, 1] if the values without one of these are constant.
     """
     if np.count_nonzero(np.isfinite(values)) < _FEWEST:
         return {}
@@ -211,7 +212,7 @@ def _grouped(
         def index(sums: FloatArray) -> float:
             product, square, mean = sums[:3] / sums[3]
             variance = square - mean**2
-            same = (product - mean**2) / variance if variance > 0.0 else 1.0
+            same = (product - mean**2) / variance if variance > 0.0 else np.nan
             return float(same if sign > 0.0 else 1.0 - same)
 
         total = sums.sum(axis=1)
@@ -224,8 +225,11 @@ def _grouped(
 
 
 def _jackknife(value: float, without: Sequence[float], samples: int) -> Estimate:
-    """Return a value with the interval of its values without each replicate."""
+    """Return a value, NaN as 0, with the interval of its values without each replicate."""
     count = len(without)
+    if not np.isfinite([value, *without]).all():
+        # All variance may be of one replicate, as of a single event.
+        return Estimate(min(max(0.0, value), 1.0), 0.0, 1.0, samples)
     error = sqrt((count - 1) / count * float(np.sum((np.array(without) - np.mean(without)) ** 2)))
     half = float(stdtrit(count - 1, 1.0 - _TAIL)) * error
     # A fraction: also of an estimate with an error.
@@ -242,6 +246,8 @@ def _sorted(values: FloatArray, by: FloatArray, parts: IntArray) -> Estimate:
 
     def index(kept: BoolArray) -> float:
         y_, by_ = y[kept], by[kept]
+        if np.ptp(y_) == 0.0:
+            return np.nan
         groups = np.array_split(y_[np.argsort(by_, kind='stable')], _GROUPS)
         between = sum(len(one) * (one.mean() - y_.mean()) ** 2 for one in groups)
         between /= len(y_) * y_.var()

@@ -733,6 +733,20 @@ def test_values_without_variance_have_no_cause() -> None:
     assert {value for one in found.values() for value in (*one.first[:3], *one.total[:3])} == {0.0}
 
 
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(('design', 'count'), [('random', 1), ('saltelli', 1), ('saltelli', 8)])
+def test_a_single_event_determines_no_cause(design: str, count: int) -> None:
+    """Without its part there is no variance; all 8 samples of a group are in the same part."""
+    study = build_study({**small(design), 'samples': 1000})
+    y = np.zeros(1000)
+    y[:count] = 1.0
+    found = indices(y, study.draw(0, 1000), study)
+    assert found
+    for one in found.values():
+        for index in (one.first, one.total or one.first):
+            assert 0.0 == index.low <= index.value <= index.high == 1.0
+
+
 def test_worst_samples_do_not_depend_on_batches() -> None:
     y = np.random.default_rng(2).standard_normal(20_000)
     y[::100] = np.nan
