@@ -176,9 +176,7 @@ def build_study(document: Any) -> Study:
         name: distribution(f'population: {name}', given[name], known[name].unit)
         for name in sorted(given)
     }
-    lengths = {(one.rows, len(one.numbers)) for one in population.values() if one.rows}
-    if len({rows for rows, _ in lengths}) < len(lengths):
-        raise ParameterError('population: variables of the same table must have as many rows')
+    _check_tables(population)
     for name, one in population.items():
         least, most = one.ends(INSIDE, BELOW)
         low, high, unit = known[name].low, known[name].high, known[name].unit
@@ -193,6 +191,20 @@ def build_study(document: Any) -> Study:
         raise ParameterError(f'{changed[0]} is not the file with which the study was begun')
     content = {**document, _FILES: files} if files else dict(document)
     return Study(scenario, DESIGNS[design](samples, seed, factor), population, content)
+
+
+def _check_tables(population: Mapping[str, Distribution]) -> None:
+    lengths = {(one.rows, len(one.numbers)) for one in population.values() if one.rows}
+    if len({rows for rows, _ in lengths}) < len(lengths):
+        raise ParameterError('population: variables of the same table must have as many rows')
+    alone = [name for name, one in population.items() if not one.rows]
+    for name, one in population.items():
+        # Correlations and indices have one name for each independent dimension.
+        if one.rows in alone:
+            raise ParameterError(
+                f'population: the table of {name} must not have the name of a variable without '
+                f'a table ({", ".join(alone)}), got {one.rows!r}'
+            )
 
 
 def _whole(document: Mapping[str, Any], key: str, low: int, high: int) -> int:

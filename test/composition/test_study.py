@@ -942,6 +942,9 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'population': {'skin': {'rows': [], 'of': 'a'}}}, 'rows must have values'),
         ({'population': {'skin': {'rows': [1], 'of': 'a'}, 'lost': {'rows': [0, 0], 'of': 'a'}}},
          'variables of the same table must have as many rows'),
+        ({'population': {'tilt_x': {'normal': [0, 0.01]}, 'skin': 1,
+                         'tilt_z': {'rows': [0.01, 0.02], 'of': 'tilt_x'}}},
+         "name of a variable without a table (skin, tilt_x), got 'tilt_x'"),
     ],
 )  # fmt: skip
 def test_invalid_studies_are_rejected(
