@@ -126,9 +126,11 @@ _Alternative = Callable[[Recording, _Candidate], _Candidate | None]
 def _fitted(signals: FilteredSignals, *remarks: str) -> _Candidate:
     """Fit at the lag that the motion determines, with its rest as an unknown, if any."""
     settings = signals.settings
-    coarse, design = find_lag(signals)
-    if design is not None:
+    coarse, fine = find_lag(signals)
+    if fine is not None:
+        design = select_samples(signals, fine, abs(fine))
         design.check()
+        design = design.with_lag_column()
         fit = design.solve(settings.terms, settings.estimator)
         # The force is not linear in a lag above the filter length.
         if fit.errors[-1] < HALF_LENGTH / settings.cutoff:

@@ -41,8 +41,8 @@ SAME_SCALE: Final = 0.01  #: largest error of the scale of a velocity that is no
 _UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
 
 
-def find_lag(signals: FilteredSignals) -> tuple[float, Design | None]:
-    """Return the coarse lag [s] (0: none), and the samples near the lag of least misfit."""
+def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
+    """Return the coarse lag [s] (0: none), and the lag of least misfit [s] (None: unknown)."""
     terms = signals.settings.terms
     if 'inertia' in terms:
         # It resembles a lag.
@@ -58,13 +58,13 @@ def find_lag(signals: FilteredSignals) -> tuple[float, Design | None]:
         design = design.with_lag_column()
         x, used = design.regressors(terms)[design.used], design.used
         change = float(np.linalg.lstsq(x, signals.force[used], rcond=None)[0][-1])
-        if abs(lag + change) > 2.0 * _LARGEST_LAG:
+        lag += change
+        if abs(lag) > 2.0 * _LARGEST_LAG:
             return coarse, None
         # The last step is part of the final regression.
         if abs(change) < 0.05 * signals.period:
             break
-        lag += change
-    return coarse, design
+    return coarse, lag
 
 
 def _coarse_lag(signals: FilteredSignals) -> float:
