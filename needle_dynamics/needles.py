@@ -23,6 +23,7 @@ DEFAULT_NEEDLE: Final = 'bending_35mm'
 
 FILES: Final = ('.yaml', '.yml')  #: Ends of the names of files of needles.
 DIAMETERS: Final = ('outer_diameter', 'inner_diameter')  #: of a tube, in place of its area
+_WIDEST: Final = 0.02  # largest diameter [m]: a value in mm is an error
 _PREFIXES: Final = ('model.', 'steering.')  #: Prefixes of the constants in a ROS parameter file.
 
 
@@ -74,10 +75,10 @@ def of_tube(values: Mapping[str, Any]) -> dict[str, Any]:
         quantity(value, 'm') if isinstance(value := values.get(name, 0.0), str) else value
         for name in DIAMETERS
     )
-    if not (is_number(outer) and is_number(inner) and 0.0 <= inner < outer):
+    if not (is_number(outer) and is_number(inner) and 0.0 <= inner < outer <= _WIDEST):
         raise ParameterError(
-            'outer_diameter and inner_diameter must be 0 <= inner < outer [m], got '
-            f'{outer!r} and {inner!r}'
+            f'outer_diameter and inner_diameter must be 0 <= inner < outer <= {_WIDEST:g} m, got '
+            f'{outer!r} and {inner!r}: 0.7mm is a length, too'
         )
     if clash := [name for name in ('area', 'area_moment') if name in others]:
         raise ParameterError(f'{clash[0]} is given by the diameters, too: omit one of them')

@@ -109,7 +109,11 @@ class SteeringPrior(CheckedSettings):
     )  # fmt: skip
     path_noise_length: float = same_field(SteeringParameters, 'path_noise_length')
     noise: float = constant(
-        4e-5, 'm', 'standard deviation of a tip measurement, along each axis', open_low=True
+        4e-5,
+        'm',
+        'standard deviation of a tip measurement, along each axis',
+        high=0.1,
+        open_low=True,
     )
     drift: float = constant(
         5e-4, 'm', 'standard deviation of a slow error of the tip sensor; 0, one and three times '

@@ -82,10 +82,11 @@ def test_parameter_file_of_nodes_is_a_needle(tmp_path: Path) -> None:
         ('length: 3N\n', 'mine.yaml: length must be a number, or text with a unit of m'),
         (
             'outer_diameter: 1mm\ninner_diameter: 2mm\n',
-            'must be 0 <= inner < outer [m], got 0.001',
+            'must be 0 <= inner < outer <= 0.02 m, got 0.001',
         ),
         ('outer_diameter: 3N\n', "mine.yaml: '3N' is not a length"),
-        ('inner_diameter: 1mm\n', 'must be 0 <= inner < outer [m], got 0.0 and'),
+        ('inner_diameter: 1mm\n', 'must be 0 <= inner < outer <= 0.02 m, got 0.0 and'),
+        ('outer_diameter: 0.7\n', 'must be 0 <= inner < outer <= 0.02 m, got 0.7 and'),
         ('outer_diameter: 1mm\narea: 1mm^2\n', 'area is given by the diameters, too'),
         ('outer_diamter: 1mm\n', "did you mean 'outer_diameter'"),
         ('a: [', 'mine.yaml is not YAML'),

@@ -124,11 +124,11 @@ def test_target_is_hit_within_the_prior_uncertainty(
     roll: float,
     target: tuple[float, float],
 ) -> None:
-    """With almost no noise within 0.2 mm; open loop misses by millimeters."""
+    """Within 0.2 mm, with a quarter of the noise of the prior; open loop misses by millimeters."""
     needle, steering = other(length, skin)
     one = SteeredNeedle(needle, replace(steering, bevel_load=(bevel,)), tilt=tilt, roll=roll)
     controller = MultiHypothesisLaw(MODEL, target, LIMITS)
-    tip = steer(controller, one)
+    tip = steer(controller, one, 1e-5)
     # Half the distance of the compared positions, and the remaining uncertainty.
     assert np.hypot(*(tip - target)) < 2e-4
     assert np.abs(one.guide).max() <= 6e-3
@@ -302,7 +302,7 @@ def test_target_out_of_reach_is_rejected_with_the_reachable_set() -> None:
         OutOfReachError, match=r'x = 40\.00 mm, z = 0\.00 mm is out of reach: reachable'
     ):
         MultiHypothesisLaw(MODEL, (0.04, 0.0), LIMITS)
-    with pytest.raises(OutOfReachError, match=r'reachable are x = 0\.00 ± \d'):
+    with pytest.raises(OutOfReachError, match=r'reachable on average are x = 0\.00 ± \d'):
         MultiHypothesisLaw(MODEL, (8e-3, 0.0), replace(LIMITS, guide_limit=1e-4))
 
 

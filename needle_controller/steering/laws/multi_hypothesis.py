@@ -295,8 +295,8 @@ class MultiHypothesisLaw(SteeringLaw):
         middle, size = 1e3 * complex(w @ middles), 1e3 * complex(w @ sizes)
         x, z = 1e3 * self.target
         return (
-            f'the target x = {x:.2f} mm, z = {z:.2f} mm is {target}: reachable are '
-            f'x = {middle.real:.2f} ± {size.real:.2f} mm, z = {middle.imag:.2f} ± '
+            f'the target x = {x:.2f} mm, z = {z:.2f} mm is {target}: reachable '
+            f'on average are x = {middle.real:.2f} ± {size.real:.2f} mm, z = {middle.imag:.2f} ± '
             f'{size.imag:.2f} mm'
         )
 
