@@ -22,7 +22,7 @@ import struct
 from typing import Any, Final, NamedTuple
 import zlib
 
-from needle_dynamics.arrays import FloatArray, IntArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.bags.bag import form_of, MATLAB, METADATA, TABLES
 from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
@@ -264,14 +264,11 @@ def sorted_rows(
     usable = np.isfinite(rows).all(axis=1) & np.isfinite(time)
     if lost := int(np.count_nonzero(~usable)):
         losses.append(f'{lost} rows with a value that is not a number, left out')
+    if np.count_nonzero(usable) < 2:
+        count = np.count_nonzero(usable)
+        raise RecordingError('; '.join([f'{path} has {count} usable rows', *losses]))
+    check_restart(path, time, usable)
     time, rows = time[usable], rows[usable]
-    if len(time) < 2:
-        raise RecordingError('; '.join([f'{path} has {len(time)} usable rows', *losses]))
-    if row := _restart(time):
-        row = int(np.flatnonzero(usable)[row]) + 1
-        raise RecordingError(
-            f'{path}: time restarts at row {row} of {len(usable)}: split the file'
-        )
     start = float(time.min())
     since = time - start
     if not since.max() < 1e9:
@@ -285,12 +282,21 @@ def sorted_rows(
     return start, series.stamps, series.values
 
 
-def _restart(time: FloatArray) -> int:
+def check_restart(path: Path, time: FloatArray, usable: BoolArray, least: int = _RUN) -> None:
+    """Raise a RecordingError if the time begins again, in runs of at least some mean rows."""
+    if row := _restart(time[usable], least):
+        row = int(np.flatnonzero(usable)[row]) + 1
+        raise RecordingError(
+            f'{path}: time restarts at row {row} of {len(usable)}: split the file'
+        )
+
+
+def _restart(time: FloatArray, least: int) -> int:
     """Return the first row of a second run in a table, whose time begins again; else 0."""
     steps = np.diff(time)
     back = np.flatnonzero(are_gaps(np.abs(steps)) & (steps < 0.0)) + 1
     # Rows in any order are sorted.
-    if len(back) > len(time) // _RUN:
+    if len(back) > len(time) // least:
         return 0
     latest = time.min() + _NEAR * np.ptp(time)
     for begin, end in pairwise([*back, len(time)]):

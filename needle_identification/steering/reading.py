@@ -15,6 +15,7 @@ rows.
 """
 
 from collections.abc import Mapping
+from itertools import pairwise
 from math import pi
 from pathlib import Path
 import re
@@ -70,6 +71,9 @@ _FAR: Final = 2.0  # largest distance from the origin of a frame [m]
 _TURNS: Final = 4.0 * pi  #: largest roll [rad]
 _ALONG: Final = 0.5  # least motion of the tip along the needle over the insertion
 _TIP_ALONG: Final = {'along': ('tipy', 'ytip', 'tip2')}  # position along the needle
+_RUN: Final = 10  # least mean number of rows of each of several insertions in one table
+_OUTSIDE: Final = 0.1  # depth of a needle that is withdrawn, as a part of the deepest
+_INSIDE: Final = 0.25  # depth of an insertion, as a part of the deepest
 _MOVED_ROLES: Final = ('depth', 'guide_x', 'guide_z')
 _COMPONENT: Final = re.compile(r'[\s._-]*[xyz]$', re.IGNORECASE)  # ``x`` of ``Base x``
 
@@ -176,10 +180,43 @@ def _of_table(path: Path, columns: Mapping[str, str], medium: str) -> SteeringRe
     usable = np.isfinite(moved).all(axis=1)
     if lost := int(np.count_nonzero(~usable)):
         losses.append(f'{lost} rows with a value that is not a number, left out')
-    if np.count_nonzero(usable & new) < 2:
+    used = usable & new
+    if np.count_nonzero(used) < 2:
         raise RecordingError('; '.join([f'{path} has fewer than 2 usable rows', *losses]))
-    values = {role: column[usable & new] for role, column in values.items()}
-    return recorded_insertion(path, medium, values, losses)
+    _check_time(table, used)
+    values = {role: column[used] for role, column in values.items()}
+    found = recorded_insertion(path, medium, values, losses)
+    if again := _second_insertion(found.depth):
+        # Rows are left out at the start only.
+        row = int(np.flatnonzero(used)[again - len(found.depth)]) + 1
+        raise RecordingError(
+            f'{path}: a second insertion starts at row {row} of {len(used)}, with a depth of '
+            f'{1e3 * found.depth[again]:.3g} mm after {1e3 * found.depth[:again].max():.3g} mm: '
+            'split the file, one for each insertion'
+        )
+    return found
+
+
+def _check_time(table: Table, used: BoolArray) -> None:
+    """Raise a RecordingError if a column of time, with any unit, begins again."""
+    spec = tables.guessed(table.columns, {'time': tables.TIME_NAMES}).get('time')
+    if spec is None:
+        return
+    time = table.columns.get(spec)
+    if time is None:
+        time = tables.column_values(table, 'time', spec, [])
+    tables.check_restart(table.path, time, used & np.isfinite(time), _RUN)
+
+
+def _second_insertion(depth: FloatArray) -> int:
+    """Return the row at which a needle outside is inserted again, else 0."""
+    (inside,) = np.nonzero(depth > _INSIDE * depth.max())
+    for begin, end in pairwise(inside.tolist()):
+        between = depth[begin:end]
+        if between.min() < _OUTSIDE * depth.max():
+            # The last row before the insertion.
+            return int(end - 1 - np.argmin(between[::-1]))
+    return 0
 
 
 def _shifted(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:

@@ -121,3 +121,46 @@ def test_a_named_column_keeps_the_selection_of_rows(tmp_path: Path) -> None:
     assert len(plain.depth) == 6
     assert_allclose(named.depth, plain.depth)
     assert_allclose(named.guide, plain.guide)
+
+
+def inserted(depth: FloatArray) -> FloatArray:
+    """Return depth, guide and tip [m], (n, 5), with lateral positions of a few millimeters."""
+    rng = np.random.default_rng(len(depth))
+    return np.column_stack([depth, 2e-3 * rng.normal(size=(len(depth), 4))])
+
+
+NAMES: Final = 'depth [m],guide_x [m],guide_z [m],tip_x [m],tip_z [m]'
+INTO: Final = np.linspace(0.0, 0.1, 21)
+
+
+@pytest.mark.parametrize('names', ['time [s]', 'sec,nanosec'])
+def test_a_second_run_in_a_table_is_an_error(tmp_path: Path, names: str) -> None:
+    """By its time, in two insertions of 21 readings each, also deeper and deeper."""
+    time = np.column_stack([2.0 * np.arange(21.0), np.zeros((21, names.count(',')))])
+    runs = [np.column_stack([time, inserted(0.5 * INTO + begin)]) for begin in (0.0, 0.05)]
+    path = written(tmp_path / 'two.csv', f'{names},{NAMES}', np.vstack(runs))
+    with pytest.raises(RecordingError, match='time restarts at row 22 of 42: split the file'):
+        read_steering_recording(path)
+    one = written(tmp_path / 'one.csv', f'{names},{NAMES}', runs[0])
+    assert len(read_steering_recording(one).depth) == 21
+
+
+@pytest.mark.parametrize('deepest', [(0.1, 0.1, 0.1), (0.03, 0.1), (0.1, 0.03)])
+@pytest.mark.parametrize('air', [0, 4])
+def test_a_second_insertion_in_a_table_is_an_error(
+    tmp_path: Path, deepest: tuple[float, ...], air: int
+) -> None:
+    """By its depth, without a time; rows in front of the skin, left out, count as rows."""
+    depth = np.concatenate([-1e-3 * np.arange(air), *(10.0 * most * INTO for most in deepest)])
+    path = written(tmp_path / 'runs.csv', NAMES, inserted(depth))
+    words = f'second insertion starts at row {22 + air} of {len(depth)}, with a depth of 0 mm'
+    with pytest.raises(RecordingError, match=f'{words} after .* mm: split the file, one for each'):
+        read_steering_recording(path)
+
+
+def test_a_needle_that_is_withdrawn_is_one_insertion(tmp_path: Path) -> None:
+    """Slowly at the end, and by a part before the insertion continues."""
+    out = np.linspace(0.1, 0.0, 100)
+    for depth in ([*INTO, *out], [*INTO[:11], *INTO[10:5:-1], *INTO[6:]], [0.0, 5e-3, *INTO]):
+        path = written(tmp_path / 'run.csv', NAMES, inserted(np.array(depth)))
+        assert len(read_steering_recording(path).depth) == len(depth)
