@@ -19,9 +19,7 @@ _UNLIKE: Final = 1.25  # smallest ratio of their noise; a warning for less would
 
 def measured_rows(tip: FloatArray) -> tuple[BoolArray, list[str]]:
     """Return which rows of positions (n, k) are measurements, and a sentence for the others."""
-    zero = (tip == 0.0).all(axis=1)
-    if zero.all() or _is_among(tip[~zero]):
-        zero[:] = False
+    zero = zero_rows(tip)
     frozen = np.zeros_like(zero)
     frozen[~zero] = _frozen(tip[~zero])
     words = []
@@ -33,6 +31,15 @@ def measured_rows(tip: FloatArray) -> tuple[BoolArray, list[str]]:
                 'lost'
             )
     return ~(zero | frozen), words
+
+
+def zero_rows(tip: FloatArray) -> BoolArray:
+    """Return which positions (n, k), NaN if missing, are zeros far from all others: lost."""
+    zero = (tip == 0.0).all(axis=1)
+    others = tip[~zero & np.isfinite(tip).all(axis=1)]
+    if not len(others) or _is_among(others):
+        zero[:] = False
+    return np.asarray(zero)
 
 
 def _is_among(tip: FloatArray) -> bool:

@@ -29,6 +29,7 @@ from needle_identification.recordings.merging import merge
 from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import Table
 from needle_identification.recordings.units import unit_of, UNITS
+from needle_identification.sensor.checks import zero_rows
 from needle_identification.steering.recording import recorded_insertion, SteeringRecording
 from needle_ros import contract, wire
 from needle_ros.quantities import signed, signed_axis
@@ -267,7 +268,12 @@ def check_depth(table: Table, spec: str) -> None:
 def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> dict[str, str]:
     """Return the unit of each role, '' if unknown or in SI units."""
     stated = {role: unit_of(given.get(role, name), role) for role, name in specs.items()}
-    moved = {role: tables.measured_values(table.columns[name]) for role, name in specs.items()}
+    tips = [table.columns[specs[role]] for role in _TIPS if role in specs]
+    seen = ~zero_rows(np.column_stack(tips)) if tips else slice(None)
+    moved = {
+        role: tables.measured_values(table.columns[name][seen if role in _TIPS else slice(None)])
+        for role, name in specs.items()
+    }
     bodies = {
         role: re.sub(r'^[xyz]|[xyz123]$', '', tables.plain_name(name))
         for role, name in specs.items()
@@ -281,7 +287,7 @@ def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> 
         if not known and any(bodies[role] == bodies['depth'] for role in roles):
             known = {found['depth']}
         if not known and 'tip_x' in group and deep is not None:
-            known = _along(table, span * UNITS['depth'][deep or 'm'])
+            known = _along(table, span * UNITS['depth'][deep or 'm'], seen)
         if not known:
             large = any(
                 np.ptp(moved[role]) > _LATERAL or np.abs(moved[role]).max() > _FAR
@@ -296,12 +302,12 @@ def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> 
     return found
 
 
-def _along(table: Table, depth: float) -> set[str]:
+def _along(table: Table, depth: float, seen: BoolArray | slice) -> set[str]:
     """Return the unit in which the tip moves along the needle by the depth [m], if any."""
     names = tables.guessed(table.columns, _TIP_ALONG)
     if 'along' not in names or not depth:
         return set()
-    span = float(np.ptp(tables.measured_values(table.columns[names['along']])))
+    span = float(np.ptp(tables.measured_values(table.columns[names['along']][seen])))
     for unit in ('m', 'cm', 'mm'):
         if _ALONG < span * UNITS['depth'][unit] / depth < 1.0 / _ALONG:
             return {'' if unit == 'm' else unit}

@@ -14,6 +14,7 @@ from needle_dynamics.display import Displayed
 from needle_dynamics.steering.needle import empty_cut
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import freeze
+from needle_identification.sensor.checks import zero_rows
 from needle_ros.errors import ShapeError
 import numpy as np
 
@@ -193,7 +194,10 @@ def recorded_insertion(
         )
     guide = np.column_stack([values['guide_x'], values['guide_z']])
     tip = np.column_stack([values['tip_x'], values['tip_z']])
-    known = tip[np.isfinite(tip).all(axis=1)]
+    measured = ~zero_rows(tip)
+    if zeros := int(np.count_nonzero(~measured)):
+        losses.append(f'{zeros} samples of the tip are zero: not measured, left out')
+    known = tip[measured & np.isfinite(tip).all(axis=1)]
     if not len(known):
         raise RecordingError(f'{path}: no row has a position of the tip')
     if len(known) > 1 and not np.ptp(known, axis=0).any() and np.ptp(depth) > _GONE:
@@ -201,7 +205,10 @@ def recorded_insertion(
             f'{path}: the tip never moves: all {len(known)} positions are equal while the needle '
             f'moves by {1e3 * np.ptp(depth):.3g} mm: check its sensor, topic or columns'
         )
-    good, wrong = credible(depth, guide - guide[0], tip - known[0])
+    good = np.zeros_like(measured)
+    good[measured], wrong = credible(
+        depth[measured], (guide - guide[0])[measured], tip[measured] - known[0]
+    )
     tip[~good] = np.nan
     return SteeringRecording(
         name=str(path),

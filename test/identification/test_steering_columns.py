@@ -164,3 +164,31 @@ def test_a_needle_that_is_withdrawn_is_one_insertion(tmp_path: Path) -> None:
     for depth in ([*INTO, *out], [*INTO[:11], *INTO[10:5:-1], *INTO[6:]], [0.0, 5e-3, *INTO]):
         path = written(tmp_path / 'run.csv', NAMES, inserted(np.array(depth)))
         assert len(read_steering_recording(path).depth) == len(depth)
+
+
+@pytest.mark.parametrize('factors', [(1.0, 1.0), (1e3, 1e3), (1.0, 1e3)])
+@pytest.mark.parametrize('origin', [(0.21, -0.13), (0.0, 0.02)])
+def test_zeros_of_a_tracker_that_is_lost_are_not_measured(
+    tmp_path: Path, factors: tuple[float, float], origin: tuple[float, float]
+) -> None:
+    """Before its first position and later, in m and mm; units are found without them."""
+    rows = np.insert(inserted(INTO), 5, 0.3 + INTO, axis=1)
+    rows[:, [3, 4]] += origin
+    expected = rows[:, 3:5].copy()
+    lost = [0, 1, 12]
+    rows[lost, 3:] = 0.0
+    rows *= np.repeat(factors, 3)
+    names = 'depth,guide_x,guide_z,tip_x,tip_z,tip_y'
+    found = read_steering_recording(written(tmp_path / 'run.csv', names, rows))
+    assert '3 samples of the tip are zero: not measured, left out' in found.losses
+    assert not any('not numbers' in line or 'implausible' in line for line in found.losses)
+    assert (~found.known).nonzero()[0].tolist() == lost
+    assert_allclose(found.tip[found.known], expected[found.known], atol=1e-12)
+
+
+def test_a_tip_at_the_origin_is_measured(tmp_path: Path) -> None:
+    """Simulations start there."""
+    rows = inserted(INTO)
+    rows[:, 3:] = np.outer(INTO**2, [0.0, 0.5])
+    found = read_steering_recording(written(tmp_path / 'run.csv', NAMES, rows))
+    assert found.known.all()
