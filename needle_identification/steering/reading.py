@@ -30,7 +30,7 @@ from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import Table
 from needle_identification.recordings.units import unit_of, UNITS
 from needle_identification.sensor.checks import zero_rows
-from needle_identification.steering.recording import recorded_insertion, SteeringRecording
+from needle_identification.steering.recording import DEEPEST, recorded_insertion, SteeringRecording
 from needle_ros import contract, wire
 from needle_ros.quantities import signed, signed_axis
 import numpy as np
@@ -65,8 +65,7 @@ USUAL: Final = {
     'roll': ('roll', 'rotation', 'theta'),
 }
 
-_LARGE: Final = 1.0  # largest depth in m
-_SMALL: Final = 25.0  # smallest depth in mm; between them the unit is cm or mm
+_SMALL: Final = 25.0  # smallest depth in mm; from `DEEPEST` to it the unit is cm or mm
 _LATERAL: Final = 0.1  # largest lateral motion [m]
 _FAR: Final = 2.0  # largest distance from the origin of a frame [m]
 _TURNS: Final = 4.0 * pi  #: largest roll [rad]
@@ -154,7 +153,7 @@ def read_steering_recording(
     both = np.hstack([tips, moved[:, : len(joints)]])
     signs = [sign for sign, _ in (*axes.values(), *joints.values())]
     values = dict(zip([*axes, *joints], (both * signs).T, strict=True))
-    return recorded_insertion(path, medium, values, losses)
+    return recorded_insertion(path, medium, values, losses, f'is {joints["depth"][1]} in m?')
 
 
 def _of_table(path: Path, columns: Mapping[str, str], medium: str) -> SteeringRecording:
@@ -186,7 +185,10 @@ def _of_table(path: Path, columns: Mapping[str, str], medium: str) -> SteeringRe
         raise RecordingError('; '.join([f'{path} has fewer than 2 usable rows', *losses]))
     _check_time(table, used)
     values = {role: column[used] for role, column in values.items()}
-    found = recorded_insertion(path, medium, values, losses)
+    spec = specs['depth']
+    name = f'{"-" * spec.startswith("-")}{tables.column_of(table, spec)}'
+    advice = f"is {spec} in mm? Use --columns 'depth={name}[mm]'"
+    found = recorded_insertion(path, medium, values, losses, advice)
     if again := _second_insertion(found.depth):
         # Rows are left out at the start only.
         row = int(np.flatnonzero(used)[again - len(found.depth)]) + 1
@@ -258,7 +260,7 @@ def check_depth(table: Table, spec: str) -> None:
     name = spec.lstrip('-')
     if name not in table.columns or unit_of(name, 'depth') is not None:
         return
-    if (span := float(np.ptp(tables.measured_values(table.columns[name])))) > _LARGE:
+    if (span := float(np.ptp(tables.measured_values(table.columns[name])))) > DEEPEST:
         raise RecordingError(
             f'{table.path}: {name} spans {span:.3g} without a unit, mm or cm: '
             f"use --columns 'depth={spec}[mm]' or 'depth={spec}[cm]'"
@@ -279,7 +281,7 @@ def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> 
         for role, name in specs.items()
     }
     span = float(np.ptp(moved['depth']))
-    deep = stated['depth'] or ('' if span <= _LARGE else 'mm' if span >= _SMALL else None)
+    deep = stated['depth'] or ('' if span <= DEEPEST else 'mm' if span >= _SMALL else None)
     found = {'depth': deep or ''}
     for group in (('guide_x', 'guide_z'), ('tip_x', 'tip_z')):
         roles = [role for role in group if role in specs]

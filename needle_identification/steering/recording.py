@@ -18,6 +18,8 @@ from needle_identification.sensor.checks import zero_rows
 from needle_ros.errors import ShapeError
 import numpy as np
 
+DEEPEST: Final = 1.0  #: largest depth [m]
+
 _FROZEN: Final = 3  # number of equal consecutive tip measurements that indicate a frozen sensor
 _GONE: Final = 5e-4  # change of depth over these, above the noise of robots [m]
 _REST: Final = 1e-5  # largest motion between rows at rest [m]
@@ -170,7 +172,7 @@ def _unset(values: Mapping[str, FloatArray]) -> int:
 
 
 def recorded_insertion(
-    path: Path, medium: str, values: Mapping[str, FloatArray], losses: Sequence[str]
+    path: Path, medium: str, values: Mapping[str, FloatArray], losses: Sequence[str], advice: str
 ) -> SteeringRecording:
     """Create a recording from values of a file by role, (n,) each, without implausible samples."""
     losses, zeros = list(losses), _unset(values)
@@ -191,6 +193,11 @@ def recorded_insertion(
         raise RecordingError(
             f'{path}: depth goes from the first row to {1e3 * depth.min():.4g} mm, out of the '
             f'skin: if it is positive out of the tissue, use --columns depth=-NAME'
+        )
+    if depth.max() > DEEPEST:
+        raise RecordingError(
+            f'{path}: depth goes to {depth.max():.4g} m, a needle to at most {DEEPEST:g} m: '
+            f'{advice}'
         )
     guide = np.column_stack([values['guide_x'], values['guide_z']])
     tip = np.column_stack([values['tip_x'], values['tip_z']])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from math import pi
 from pathlib import Path
+import re
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
@@ -192,3 +193,25 @@ def test_a_tip_at_the_origin_is_measured(tmp_path: Path) -> None:
     rows[:, 3:] = np.outer(INTO**2, [0.0, 0.5])
     found = read_steering_recording(written(tmp_path / 'run.csv', NAMES, rows))
     assert found.known.all()
+
+
+@pytest.mark.parametrize(
+    ('name', 'spec', 'words'),
+    [
+        ('d', 'd', "to 100 m, a needle to at most 1 m: is d in mm? Use --columns 'depth=d[mm]'"),
+        ('d', '-d', "is -d in mm? Use --columns 'depth=-d[mm]'"),
+        ('d [m]', 'd [m]', "is d [m] in mm? Use --columns 'depth=d [m][mm]'"),
+        ('d', 'd[cm]', 'goes to 1.2 m, a needle to at most 1 m: is d[cm] in mm? Use'),
+    ],
+)
+def test_a_needle_of_more_than_1_m_is_an_error(
+    tmp_path: Path, name: str, spec: str, words: str
+) -> None:
+    """In elements of 1.5 mm its simulation has no end."""
+    rows = inserted(INTO) * 1e3
+    rows[:, 0] *= {'-d': -1.0, 'd[cm]': 1.2}.get(spec, 1.0)
+    path = written(tmp_path / 'run.csv', NAMES.replace('depth [m]', name), rows)
+    with pytest.raises(RecordingError, match=re.escape(words)):
+        read_steering_recording(path, columns={'depth': spec})
+    right = {'depth': words.partition('depth=')[2].rstrip("'") or 'd[mm]'}
+    assert read_steering_recording(path, columns=right).depth.max() < 0.2
