@@ -66,6 +66,7 @@ _SUSPICIOUS: Final = {
     'time': (('ms', 0.99), ('us', 990.0), ('ns', 9.9e5)),
     'depth': (('mm', 2.0),),
     'speed': (('mm/s', 2.0),),
+    **dict.fromkeys(('guide_x', 'guide_z'), (('mm', 0.1),)),
 }
 _SECONDS: Final = ('sec', 'seconds')  #: Names of times that are in s.
 _BLANKS: Final = re.compile(r'(?i)(([-+]?\d+(,\d+)?(e[-+]?\d+)?|nan)( +|$)){2,}')  # decimal commas

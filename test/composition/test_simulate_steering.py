@@ -103,9 +103,11 @@ def test_motion_that_is_not_used_is_a_warning(
     _, warnings = said(capsys, *words)
     assert warnings == (
         f'warning: {way}: depth has no unit, taken in SI units: perhaps depth=depth[mm]\n'
+        f'warning: {way}: guide_x has no unit, taken in SI units: perhaps guide_x=guide_x[mm]\n'
         f'warning: {way}: its depths, 0 to 60000 mm, continue beyond --to, 70 mm\n'
     )
-    way.write_text('depth [mm],guide_x [mm]\n0,0\n30,0\n70,3\n')
+    # A motion of 0.1 m and less may be in m.
+    way.write_text('depth [mm],guide_x [mm],guide_z\n0,0,0\n30,0,0\n70,3,0.003\n')
     assert said(capsys, *words)[1] == ''
     assert said(capsys, *words[:2], *words[4:])[1] == ''
     way.write_text('depth [mm],guide_x [mm]\n0,0\n30,0\n71,3\n')
