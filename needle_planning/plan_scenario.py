@@ -30,6 +30,7 @@ from needle_controller.steering.law import (
     DEFAULT_LAW,
     find_law,
     GuideSetpoint,
+    LawError,
     SteeringFaultError,
 )
 from needle_controller.steering.planned_path import PlannedPath
@@ -299,7 +300,9 @@ class PlanScenario(Scenario):
         law = monitored(law, inputs.model, inputs.plan, path, limits, self._contact)
         stopped = False
         try:
-            simulate_steering(law, plant, sensor)
+            simulate_steering(law, plant, sensor, limits=limits, roll=inputs.plan.roll)
+        except LawError:
+            raise
         except SteeringFaultError:
             stopped = True
         shafts = self._in_image(row, np.stack(plant.shafts))

@@ -146,7 +146,7 @@ def find_class(what: str, name: Any, known: Mapping[str, str]) -> Any:
             sys.path.append(folder)
         return getattr(import_module(module), of_class)
     # The module is any code of the user.
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ParameterError(f'{valid}; {name!r} cannot be imported: {error}') from error
 
 

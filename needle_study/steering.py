@@ -9,7 +9,14 @@ from typing import Any, Final
 
 from needle_controller import OutOfReachError, SteeringModel, SteeringPrior
 from needle_controller.steering import simulation
-from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, SteeringFaultError
+from needle_controller.steering.checked_law import expected_of
+from needle_controller.steering.law import (
+    build_law,
+    DEFAULT_LAW,
+    find_law,
+    LawError,
+    SteeringFaultError,
+)
 from needle_controller.steering.settings import SIMULATION_LIMITS, SteeringLimits, step_depths
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch
 from needle_dynamics.simulated.tip_sensor import TipErrorParameters
@@ -230,7 +237,9 @@ class SteeringScenario(Scenario):
         )
         sensor = simulation.SteppedTipSensor(plant, row['tip_noise'], errors, truth.seed, rng, rng)
         try:
-            done = simulation.simulate_steering(law, plant, sensor, watch)
+            done = simulation.simulate_steering(law, plant, sensor, watch, self._numbers)
+        except LawError:
+            raise
         except SteeringFaultError:
             return {**metrics, 'stopped': 1.0}
         tip = plant.tip
@@ -238,7 +247,7 @@ class SteeringScenario(Scenario):
             'tip_x': float(tip[0]), 'tip_z': float(tip[1]), 'guide_travel': done.travel,
             'turns': float(done.turns), 'load': done.load,
         }  # fmt: skip
-        estimate = law.expected()
+        estimate = expected_of(law)
         if estimate is not None:
             metrics |= {
                 'expected_x': float(estimate.mean[0]),

@@ -112,7 +112,7 @@ def steer(
     stopped, travel, load = '', nan, nan
     try:
         law = build_law(name, model, _TARGET, limits)
-        done = simulate_steering(law, plant, lambda tip: tip, watch)
+        done = simulate_steering(law, plant, lambda tip: tip, watch, limits)
         travel, load = done.travel, done.load
     except (OutOfReachError, SteeringFaultError) as error:
         stopped = str(error)

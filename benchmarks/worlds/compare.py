@@ -82,8 +82,9 @@ def insert(name: str, laws: Sequence[str], seed: int) -> dict[str, ComparedInser
 
 def _insert(case: Case, name: str) -> ComparedInsertion:
     rolled = bool(case.scenario.curvature) and name in _ROLLED
+    limits = case.limits(roll=rolled)
     try:
-        law = build_law(LAWS[name], case.model(), case.target, case.limits(roll=rolled))
+        law = build_law(LAWS[name], case.model(), case.target, limits)
     except OutOfReachError as error:
         return ComparedInsertion(stopped=f'rejected: {error}')
     world, chance = case.world(), nan
@@ -97,7 +98,7 @@ def _insert(case: Case, name: str) -> ComparedInsertion:
             forecast = expected.contains(plant.tip)
 
     try:
-        run = simulate_steering(law, cast(SteeringPlant, world), case.sensor(), watch)
+        run = simulate_steering(law, cast(SteeringPlant, world), case.sensor(), watch, limits)
     except (SteeringFaultError, ArithmeticError) as error:
         # Including a rod that the guide bends so far that its shape cannot be computed.
         return ComparedInsertion(stopped=str(error), chance=chance)

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Averaged tip measurements, and a steering law with checked measurements and setpoints."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from math import isfinite, nan, sqrt
+from collections.abc import Mapping
+from math import nan, sqrt
 from typing import Any, Final, NamedTuple
 
 from needle_controller.compiled.guide_plan import HIT
 from needle_controller.compiled.hypotheses import MOST_MISSING, MOST_SAME
+from needle_controller.steering.checked_law import CheckedPlans, expected_of, guarded, report_of
 from needle_controller.steering.law import (
-    checked_tip,
     GuideSetpoint,
     SteeringFaultError,
     SteeringLaw,
@@ -17,7 +16,7 @@ from needle_controller.steering.law import (
 )
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import BoolArray, FloatArray
-from needle_ros.errors import NeedleError, ParameterError
+from needle_ros.errors import ParameterError
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.quantities import NORMAL
 import numpy as np
@@ -27,7 +26,6 @@ _OVER_MEDIAN: Final = 1.4826  #: Standard deviation over the median of absolute 
 _FEW: Final = 3  #: Least number of readings for outlier rejection.
 
 SAME: Final = 1e-6  #: Tolerance of equal positions [m, rad].
-_ROUNDING: Final = 1e-6  #: Tolerance of a setpoint beyond its limit [m].
 
 
 class AveragedTipMeasurement(NamedTuple):
@@ -37,14 +35,6 @@ class AveragedTipMeasurement(NamedTuple):
     error: float  #: standard error along x or z, from the scatter of the readings [m]; 0 for few
     readings: int  #: number of valid readings
     frozen: bool  #: whether at least three readings are identical in x and z
-
-
-class LawReport(NamedTuple):
-    """Members of a law after a measurement, a plan or a change of its target."""
-
-    target: FloatArray  #: x and z [m]
-    warning: str
-    status: Mapping[str, float]
 
 
 class TipMeasurements:
@@ -111,8 +101,9 @@ class GuardedLaw:
     Pass averaged tip measurements to a steering law, and check its setpoints.
 
     Faults of the tip sensor, slip of the needle, setpoints outside the limits and exceptions of
-    the law raise a `NeedleError`. ``depths`` are of the tip measurements [m], shape (n + 1,), and
-    ``noise`` is the configured standard deviation of a measurement [m].
+    the law raise a `NeedleError`. ``depths`` are of the tip measurements [m], shape (n + 1,),
+    ``noise`` is the configured standard deviation of a measurement [m], and ``roll`` as for
+    `CheckedPlans`.
     """
 
     def __init__(
@@ -122,10 +113,12 @@ class GuardedLaw:
         noise: float,
         settings: ExecutiveSettings,
         events: EventLog,
+        roll: float | None = None,
     ) -> None:
         self.law, self.depths, self.steps = law, depths, len(depths) - 1
         self._noise, self._settings, self._events = noise, settings, events
-        self.step = 0  #: number of plans so far: the number of the present depth
+        limits = settings.limits(float(np.diff(depths).max()))
+        self._plans = CheckedPlans(law, self.steps, limits, roll)
         self.expected: TipEstimate | None = None  #: tip at the target depth, new after each plan
         self.measured: AveragedTipMeasurement | None = None  #: last measurement
         self._scatter = 0.0  #: largest deviation of a reading of the tip so far [m]
@@ -134,25 +127,28 @@ class GuardedLaw:
         #: Successive missing and identical measurements, and the last measurement [m].
         self._missing = self._same = 0
         self._last = np.full(2, nan)
-        self.setpoint = GuideSetpoint(0.0, 0.0)  #: last setpoint of guide and roll
         self._warned = False
         #: Inputs of the law in their order, and its setpoints: ``aim`` x, z [m]; ``tip``, x, y, z
         #: [m], or None, with the fields of `AveragedTipMeasurement`, ``at`` and ``depth`` as in
         #: `update`; ``plan`` x, z [m], roll [rad].
         self.history: list[dict[str, Any]] = []
-        with _guarded():
-            self.report = self._reported()
+        self.report = report_of(law)
 
-    def _reported(self) -> LawReport:
-        law = self.law
-        status = {name: float(value) for name, value in law.status().items()}
-        return LawReport(checked_tip(law.target, 'the target of a law'), law.warning, status)
+    @property
+    def step(self) -> int:
+        """Number of plans so far: the number of the present depth."""
+        return self._plans.step
+
+    @property
+    def setpoint(self) -> GuideSetpoint:
+        """Last setpoint of guide and roll."""
+        return self._plans.setpoint
 
     def aim(self, target: FloatArray) -> None:
         """Change the target, x and z [m]."""
-        with _guarded():
+        with guarded(self.law):
             self.law.aim(target)
-            self.report = self._reported()
+        self.report = report_of(self.law)
         self._warned = False
         self.history.append({'aim': target.tolist()})
 
@@ -197,9 +193,9 @@ class GuardedLaw:
             self._scatter = max(self._scatter, measured.error * sqrt(measured.readings))
             noise = max(measured.error, self._scatter / sqrt(measured.readings))
         self._check_sensor(tip)
-        with _guarded():
+        with guarded(self.law):
             self.law.update(tip, at, noise)
-            self.report = self._reported()
+        self.report = report_of(self.law)
 
     def _check_slip(self, measured: AveragedTipMeasurement, depth: float) -> None:
         """Compare the depth of the tip with the insertion depth [m]."""
@@ -234,26 +230,8 @@ class GuardedLaw:
 
     def plan(self) -> GuideSetpoint:
         """Plan the next step, and log a new warning."""
-        settings, k = self._settings, self.step
-        with _guarded():
-            to = GuideSetpoint(*map(float, self.law.plan()))
-            self.expected, self.report = self.law.expected(), self._reported()
-        most = settings.guide_limit + _ROUNDING
-        # False for nan.
-        if not (abs(to.x) <= most and abs(to.z) <= most and isfinite(to.roll)):
-            raise SteeringFaultError(
-                f'the steering law requests the guide at x = {1e3 * to.x:.3f} mm, z = '
-                f'{1e3 * to.z:.3f} mm and a roll of {to.roll:.3f} rad; the limit is '
-                f'{1e3 * settings.guide_limit:g} mm'
-            )
-        widest = settings.limits(float(np.diff(self.depths).max())).guide_step + _ROUNDING
-        change = max(abs(to.x - self.setpoint.x), abs(to.z - self.setpoint.z))
-        if change > widest:
-            raise SteeringFaultError(
-                f'the steering law requests a guide motion of {1e3 * change:.3f} mm in a step, at '
-                f'most {1e3 * widest:.3f} mm are possible'
-            )
-        self.setpoint, self.step = to, k + 1
+        k, to = self.step, self._plans.plan()
+        self.expected, self.report = expected_of(self.law), report_of(self.law)
         self.history.append({'plan': [*to]})
         if k < self.steps and self.report.warning and not self._warned:
             self._warned = True
@@ -287,14 +265,3 @@ class GuardedLaw:
         if most <= HIT:
             return line, Severity.INFO
         return f'{line}, at most {1e3 * most:.2f} mm', Severity.WARNING
-
-
-@contextmanager
-def _guarded() -> Iterator[None]:
-    """Convert any exception of a law to a fault: a law may be code of the user."""
-    try:
-        yield
-    except NeedleError:
-        raise
-    except Exception as error:
-        raise SteeringFaultError(f'the steering law has failed: {error!r}') from error

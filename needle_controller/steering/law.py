@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, nan
+from reprlib import repr as shortened
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from needle_controller.steering.planned_path import PlannedPath
@@ -36,6 +37,10 @@ _CHI_SQUARED: Final = 5.991
 
 class SteeringFaultError(JobError):
     """The tip measurement is implausible, frozen or missing, or the law has failed."""
+
+
+class LawError(SteeringFaultError):
+    """A steering law raises an exception, or its results have the wrong form."""
 
 
 class ContactError(SteeringFaultError):
@@ -129,6 +134,15 @@ class SteeringLaw(Protocol):
 LawClass: TypeAlias = Callable[[SteeringModel, ArrayLike, SteeringLimits, float], SteeringLaw]
 
 
+def law_name(law: SteeringLaw) -> str:
+    """Return the class of a law as ``module:Class``."""
+    return f'{type(law).__module__}:{type(law).__qualname__}'
+
+
+def failed_law(law: SteeringLaw, what: str) -> LawError:
+    return LawError(f'the steering law {law_name(law)} has failed: {what}')
+
+
 def find_law(name: str) -> LawClass:
     """Return the class of a law: a key of `STEERING_LAWS`, or a class as ``module:Class``."""
     found: LawClass = find_class('law', name, STEERING_LAWS)
@@ -172,7 +186,7 @@ def build_law(
     except NeedleError:
         raise
     # The constructor is any code of the user.
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ParameterError(f'law {name!r} cannot be constructed: {error}') from error
     members = 'target', 'step', 'warning', 'aim', 'update', 'plan', 'expected', 'status'
     missing = [name for name in members if not hasattr(law, name)]
@@ -248,13 +262,21 @@ class GuideLaw(ABC):
     def plan(self) -> GuideSetpoint:
         guide, most, change = self.guides[-1], self.limits.guide_limit, self.limits.guide_step
         if self._newest is not None and self.step < len(self.depths) - 1:
-            wanted = np.clip(self.choose(*self._newest), guide - change, guide + change)
+            wanted = np.clip(self._chosen(*self._newest), guide - change, guide + change)
             guide = self._within_load(np.clip(wanted, -most, most))
         self._newest = None
         self.guides.append(guide)
         self.step += 1
         x, z = guide.tolist()
         return GuideSetpoint(x, z, self.roll)
+
+    def _chosen(self, tip: FloatArray, at: int) -> FloatArray:
+        found: object = self.choose(tip, at)
+        try:
+            return floats('guide', found, (2,))
+        except NeedleError as error:
+            said = f'choose must return x and z of the guide [m], finite, got {shortened(found)}'
+            raise failed_law(self, said) from error
 
     def _within_load(self, guide: FloatArray) -> FloatArray:
         """Return the guide [m], less of its motion where it would exceed the load limit."""

@@ -9,8 +9,9 @@ from math import hypot
 from time import perf_counter
 from typing import NamedTuple
 
+from needle_controller.steering.checked_law import CheckedPlans, guarded
 from needle_controller.steering.law import GuideSetpoint, SteeringLaw
-from needle_controller.steering.settings import SteeringPrior
+from needle_controller.steering.settings import SteeringLimits, SteeringPrior
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.tip_sensor import TipErrorParameters, TipErrors
@@ -175,27 +176,33 @@ def simulate_steering(
     plant: SteeringPlant,
     sensor: Callable[[FloatArray], FloatArray | None],
     watch: Callable[[SteeringPlant], object] | None = None,
+    limits: SteeringLimits | None = None,
+    roll: float = 0.0,
 ) -> SteeringRun:
     """
     Insert a simulated needle in steps: measure the tip, plan, move guide and roll, insert.
 
     ``sensor`` returns a measurement of the tip, shape (2,) [m], or None. ``watch`` is called after
-    each step. Raises `SteeringFaultError` if the law stops the insertion.
+    each step. ``roll`` is that of the needle at the start as given to the law [rad]. Raises
+    `SteeringFaultError` if the law stops the insertion or exceeds ``limits``, if they are given,
+    and `LawError` if it fails.
     """
-    to, travel, turns, load = GuideSetpoint(0.0, 0.0), 0.0, 0, 0.0
+    plans = CheckedPlans(law, len(plant.depths) - 1, limits, roll)
+    travel, load = 0.0, 0.0
     warning, times = '', list[float]()
     while True:
         tip = sensor(plant.tip)
         begin = perf_counter()
-        law.update(tip, plant.step)
-        before, to = to, law.plan()
+        with guarded(law):
+            law.update(tip, plant.step)
+        before, to = plans.setpoint, plans.plan()
         times.append(perf_counter() - begin)
         travel += hypot(to.x - before.x, to.z - before.z)
-        turns += to.roll != before.roll
         if plant.done:
-            return SteeringRun(travel, turns, load, warning, times)
-        if not warning and (new := law.warning):
-            warning = f'at a depth of {1e3 * plant.depths[plant.step]:.4g} mm: {new}'
+            return SteeringRun(travel, plans.turns, load, warning, times)
+        with guarded(law):
+            if not warning and (new := law.warning):
+                warning = f'at a depth of {1e3 * plant.depths[plant.step]:.4g} mm: {new}'
         plant.guide(to)
         load = max(load, hypot(*plant.needle.guide_load[0].tolist()))
         plant.insert()

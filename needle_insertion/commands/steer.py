@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from needle_controller import OutOfReachError, SIMULATION_LIMITS, SteeringModel, SteeringPrior
 from needle_controller.steering import simulation
+from needle_controller.steering.checked_law import expected_of, report_of
 from needle_controller.steering.law import build_law, DEFAULT_LAW, find_law, STEERING_LAWS
 from needle_controller.steering.responses import OF_NEEDLE, OF_STEERING
 from needle_controller.steering.settings import step_depths
@@ -168,9 +169,9 @@ def run(options: argparse.Namespace) -> int:
     ours, alone = truth.plant(depths), truth.plant(depths[[0, -1]])
     sensor = simulation.SteppedTipSensor(ours, prior.noise, errors, options.seed, noise, losses)
     with ProgressLine('steering', brief=True) as show:
-        done = simulation.simulate_steering(law, ours, sensor, watch)
+        done = simulation.simulate_steering(law, ours, sensor, watch, limits)
         alone.insert()
-    tip, other, expected = ours.tip, alone.tip, law.expected()
+    tip, other, expected = ours.tip, alone.tip, expected_of(law)
     found: dict[str, Any] = {
         'target [m]': aim.tolist(),
         'tip [m]': tip.tolist(),
@@ -186,7 +187,7 @@ def run(options: argparse.Namespace) -> int:
         'guide travel [m]': done.travel,
         'turns': done.turns,
         'largest load on the guide [N]': done.load,
-        'bending length ratio': law.status().get('bending_length_ratio'),
+        'bending length ratio': report_of(law).status.get('bending_length_ratio'),
         'warnings': [done.warning] if done.warning else [],
     }
     common.print_each('warning', found['warnings'])

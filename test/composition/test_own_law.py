@@ -8,7 +8,8 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from needle_controller import build_law, GuideSetpoint, SteeringLimits, SteeringModel
+from needle_controller import build_law, GuideLaw, GuideSetpoint, SteeringLimits, SteeringModel
+from needle_controller.steering.law import LawError
 from needle_insertion.cli import main
 from needle_ros.errors import ParameterError
 from needle_study.study import build_study
@@ -127,7 +128,9 @@ def test_invalid_law_is_rejected_in_one_line(
         (lambda _: GuideSetpoint(0.0, np.nan), 'requests the guide at x = 0.000 mm, z = nan mm'),
         (lambda _: GuideSetpoint(0.0, 3e-3), 'requests a guide motion of 3.000 mm in a step'),
         (lambda step: GuideSetpoint(0.0, 1e-3 / (3 - step)), 'ZeroDivisionError'),
-        (lambda _: None, 'the steering law has failed'),
+        (lambda _: None, 'FaultyLaw has failed: plan must return a GuideSetpoint, got None'),
+        (lambda _: sys.exit(0), 'FaultyLaw has failed: SystemExit(0)'),
+        (lambda step: GuideSetpoint(0.0, 0.0, step), 'requests turn 1 of the needle'),
     ],
 )
 def test_fault_of_a_law_stops_the_insertion(plan: Any, fault: str) -> None:
@@ -137,6 +140,101 @@ def test_fault_of_a_law_stops_the_insertion(plan: Any, fault: str) -> None:
     robot.steer()
     assert fault in robot.loop.fault
     assert np.abs(np.array(robot.tracked)[:, 1:]).max() < 2e-3
+
+
+class FaultyGuide(GuideLaw):
+    """A law whose choice has the wrong form."""
+
+    choice: Any = None
+
+    def choose(self, tip: Any, at: int) -> Any:  # noqa: ARG002
+        return self.choice
+
+
+def failed_steering(law: type, capsys: pytest.CaptureFixture[str]) -> str:
+    """Run `needle steer` with a law that fails; return its only line without the name."""
+    words = ['--target', '2mm,50mm,1mm', '--limit', '1mm']
+    name = f'{__name__}:{law.__name__}'
+    assert main(['steer', '--law', name, *words]) == 1
+    found = capsys.readouterr()
+    assert found.out == ''
+    begin, line = f'error: the steering law {name} ', found.err
+    assert line.startswith(begin)
+    assert line.count('\n') == 1
+    return line.removeprefix(begin).rstrip('\n')
+
+
+@pytest.mark.parametrize(
+    ('plan', 'fault'),
+    [
+        (lambda _: GuideSetpoint(0.05, 0.0), 'requests the guide at x = 50.000 mm'),
+        (lambda _: GuideSetpoint(np.nan, 0.0), 'requests the guide at x = nan mm'),
+        (lambda _: GuideSetpoint(0.0, 0.0, 1.0), 'requests turn 1 of the needle, to a roll of'),
+        (lambda _: None, 'has failed: plan must return a GuideSetpoint, got None'),
+        (lambda step: GuideSetpoint(1e-4 / (3 - step), 0.0), 'has failed: ZeroDivisionError('),
+        (lambda _: sys.exit(0), 'has failed: SystemExit(0)'),
+    ],
+)
+def test_fault_of_a_law_ends_the_command_in_one_line(
+    plan: Any, fault: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(FaultyLaw, 'plans', plan)
+    assert failed_steering(FaultyLaw, capsys).startswith(fault)
+
+
+@pytest.mark.parametrize(
+    ('member', 'value', 'fault'),
+    [
+        ('plan', lambda _: GuideSetpoint(0.0, 0.0), 'step must be 1 after plan 1, got 0'),
+        ('expected', lambda _: (0.0, 0.0), 'expected must return a TipEstimate or None, got (0.'),
+        ('status', lambda _: None, 'AttributeError('),
+        ('warning', property(lambda law: 1 / (1 - law.step)), 'ZeroDivisionError('),
+        ('update', lambda *_: 1 / 0, 'ZeroDivisionError('),
+    ],
+)  # fmt: skip
+def test_failed_member_of_a_law_ends_the_command_in_one_line(
+    member: str, value: Any, fault: str,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setattr(FaultyLaw, 'plans', lambda _: GuideSetpoint(0.0, 0.0))
+    monkeypatch.setattr(FaultyLaw, member, value)
+    assert failed_steering(FaultyLaw, capsys).startswith(f'has failed: {fault}')
+
+
+@pytest.mark.parametrize('choice', [None, 1e-3, [0.0, 0.0, 0.0], [np.nan, 0.0], 'left', [1j, 0.0]])
+def test_choice_of_a_guide_law_is_two_finite_numbers(
+    choice: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(FaultyGuide, 'choice', choice)
+    line = failed_steering(FaultyGuide, capsys)
+    assert line.startswith('has failed: choose must return x and z of the guide [m], finite, got ')
+
+
+def test_study_counts_setpoints_beyond_a_limit_and_ends_if_a_law_fails(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    study = build_study({
+        'scenario': 'steering', 'samples': 2,
+        'settings': {'law': f'{__name__}:FaultyLaw', 'depth': 0.02},
+    })  # fmt: skip
+    monkeypatch.setattr(FaultyLaw, 'plans', lambda _: GuideSetpoint(7e-3, 0.0))
+    assert study.rows(0, 2)['stopped'].tolist() == [1.0, 1.0]
+    monkeypatch.setattr(FaultyLaw, 'plans', lambda _: None)
+    with pytest.raises(LawError, match='FaultyLaw has failed: plan must return a GuideSetpoint'):
+        study.rows(0, 2)
+
+
+@pytest.mark.parametrize('where', ['module', 'constructor'])
+def test_law_that_exits_is_rejected_in_one_line(
+    where: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    name = f'law_that_exits_in_its_{where}'
+    inside = 'class Law:\n    def __init__(self, *_):\n        ' if where == 'constructor' else ''
+    (tmp_path / f'{name}.py').write_text(f'import sys\n\n\n{inside}sys.exit(0)\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(['steer', '--law', f'{name}:Law']) == 2
+    assert capsys.readouterr().err.count('\n') == 1
 
 
 @pytest.mark.requirement('S-135')
