@@ -12,7 +12,7 @@ from needle_controller.steering.settings import SteeringLimits, step_depths
 from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle, NeedlePreset
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.steering.parameters import SteeringParameters
+from needle_dynamics.steering.parameters import longest_insertion, SteeringParameters
 from needle_planning.anatomy import Anatomy
 from needle_planning.certificate import free_space, simulate_insertion, SimulatedInsertion
 from needle_planning.clearance import Clearance, image_frame
@@ -177,7 +177,7 @@ class _Planner:
         self.resolution = float(resolution)
         self.preset = _usable(needle)
         self.radius = needle_radius(self.preset.needle)
-        self.reach = self.preset.needle.length - self.preset.steering.free_length
+        self.reach = longest_insertion(self.preset.needle, self.preset.steering)
         _check_inside(anatomies, self.target)
         region = _region(anatomies, self.target, entry, entry_radius)
         lengths = np.linalg.norm(region.centers - self.target, axis=1)

@@ -20,7 +20,7 @@ from needle_controller.steering.law import (
 from needle_controller.steering.settings import SIMULATION_LIMITS, SteeringLimits, step_depths
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch
 from needle_dynamics.simulated.tip_sensor import TipErrorParameters
-from needle_dynamics.steering.parameters import with_bevel, with_lengths
+from needle_dynamics.steering.parameters import longest_insertion, with_bevel, with_lengths
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values, same_field
@@ -107,7 +107,7 @@ class SteeringScenario(Scenario):
             raise ParameterError(f'settings.constants: {error}') from error
         prior = scenario.mapping('settings: prior', settings.get('prior'))
         self._prior = from_values(SteeringPrior, prior, 'settings.prior.')
-        reach = self._needle.length - self._steering.free_length
+        reach = longest_insertion(self._needle, self._steering)
         if numbers.depth > reach:
             raise ParameterError(
                 f'settings.depth must be <= {reach:g} m, the length of the needle without its '

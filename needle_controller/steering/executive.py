@@ -230,9 +230,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
             moved = np.flatnonzero(np.abs(at - planned) > settings.tolerances)
             if len(moved):
                 raise JobError(f'{settings.joints[moved[0]]} has moved during planning')
-            # Without turns the roll is not a joint.
-            roll = float(taken[0].start[3]) if settings.turns else None
-            guarded = GuardedLaw(law, depths, self._noise, settings, self.events, roll)
+            guarded = GuardedLaw(law, depths, self._noise, settings, self.events)
             self.planner.resume(taken[0], guarded)
         except NeedleError as error:
             self._reject(TARGET, stamp, str(error))

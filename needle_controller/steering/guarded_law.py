@@ -101,9 +101,8 @@ class GuardedLaw:
     Pass averaged tip measurements to a steering law, and check its setpoints.
 
     Faults of the tip sensor, slip of the needle, setpoints outside the limits and exceptions of
-    the law raise a `NeedleError`. ``depths`` are of the tip measurements [m], shape (n + 1,),
-    ``noise`` is the configured standard deviation of a measurement [m], and ``roll`` as for
-    `CheckedPlans`.
+    the law raise a `NeedleError`. ``depths`` are of the tip measurements [m], shape (n + 1,), and
+    ``noise`` is the configured standard deviation of a measurement [m].
     """
 
     def __init__(
@@ -113,12 +112,11 @@ class GuardedLaw:
         noise: float,
         settings: ExecutiveSettings,
         events: EventLog,
-        roll: float | None = None,
     ) -> None:
         self.law, self.depths, self.steps = law, depths, len(depths) - 1
         self._noise, self._settings, self._events = noise, settings, events
         limits = settings.limits(float(np.diff(depths).max()))
-        self._plans = CheckedPlans(law, self.steps, limits, roll)
+        self._plans = CheckedPlans(law, self.steps, limits)
         self.expected: TipEstimate | None = None  #: tip at the target depth, new after each plan
         self.measured: AveragedTipMeasurement | None = None  #: last measurement
         self._scatter = 0.0  #: largest deviation of a reading of the tip so far [m]

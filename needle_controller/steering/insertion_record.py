@@ -39,11 +39,6 @@ class PlannedInsertion(NamedTuple):
     depths: FloatArray = np.empty(0)  #: Depths of the tip measurements [m], shape (n + 1,).
     record: SteeringRecord | None = None  #: Record of the insertion that is resumed, if it is.
 
-    @property
-    def start(self) -> Sequence[float] | FloatArray:
-        """Positions of the joints at the start of the insertion [m, rad]."""
-        return self.at if self.record is None else self.record.start
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringRecord:

@@ -124,8 +124,9 @@ class InsertionPlanner:
         settings, depths, record = self.settings, request.depths, request.record
         # The law of a record was constructed for the target at the start.
         x, _, z = request.point if record is None else record.point
+        at = request.at if record is None else record.start
         limits = settings.limits(float(request.point[1] - depths[0]) / (len(depths) - 1))
-        roll, path, plan = float(request.start[3]) if settings.turns else 0.0, None, self.plan
+        roll, path, plan = float(at[3]) if settings.turns else 0.0, None, self.plan
         if plan is not None:
             roll, path = plan.roll, plan.tip_path.since(float(depths[0]))
 

@@ -43,6 +43,7 @@ from needle_dynamics.steering.needle import steered
 from needle_dynamics.steering.parameters import (
     by_layer,
     longest_element,
+    longest_insertion,
     SteeringParameters,
     turning_load,
     with_bevel,
@@ -120,7 +121,7 @@ class SteeringModel:
                 'depths must be numbers that increase, two at least, got '
                 f'{np.array2string(at, threshold=6)} m'
             )
-        reach = needle.length - steering.free_length
+        reach = longest_insertion(needle, steering)
         if not (at[0] >= 0.0 and at[-1] <= reach):
             raise ParameterError(
                 f'depths must be in [0, {reach:g}] m, the length of the needle without its free '

@@ -28,6 +28,7 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import (
     by_layer,
     longest_element,
+    longest_insertion,
     noise_cell,
     SteeringParameters,
     turning_load,
@@ -70,10 +71,7 @@ def steered(
 ) -> Steered:
     """Return constants for compiled functions; ``wander`` (cells, 2) is of `wandering` [N]."""
     tissue = needle.tissue
-    if steering.free_length >= needle.length:
-        raise ParameterError(
-            f'free_length must be < length = {needle.length:g} m, got {steering.free_length:g} m'
-        )
+    longest_insertion(needle, steering)
     if needle.swelling != 0.0:
         raise ParameterError(f'swelling must be 0 for a steered needle, got {needle.swelling:g}')
     return Steered(

@@ -171,6 +171,15 @@ def by_layer(name: str, values: tuple[float, ...], layers: int) -> FloatArray:
     return np.broadcast_to(np.array(values, dtype=np.float64), (layers,)).copy()
 
 
+def longest_insertion(needle: NeedleParameters, steering: SteeringParameters) -> float:
+    """Return the length of a needle without its free length [m]."""
+    if steering.free_length >= needle.length:
+        raise ParameterError(
+            f'free_length must be < length = {needle.length:g} m, got {steering.free_length:g} m'
+        )
+    return needle.length - steering.free_length
+
+
 def longest_element(needle: NeedleParameters, steering: SteeringParameters) -> float:
     """Return the element length [m], within bending length and distance of the noise loads."""
     longest = steering.element

@@ -17,7 +17,7 @@ from needle_controller.steering.settings import step_depths
 import needle_dynamics as dynamics
 from needle_dynamics.needles import DIAMETERS, NeedlePreset
 from needle_dynamics.steering.needle import NeedlePath, NeedleShape
-from needle_dynamics.steering.parameters import bending_length, with_bevel
+from needle_dynamics.steering.parameters import bending_length, longest_insertion, with_bevel
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import png, table
@@ -104,7 +104,7 @@ def _target(options: argparse.Namespace, needle: NeedlePreset) -> dynamics.Float
     find_law(options.law)
     check_whole('--seed', options.seed, 0, LARGEST_SEED)
     target = np.array(read_target(' '.join(options.target)))
-    reach = needle.needle.length - needle.steering.free_length
+    reach = longest_insertion(needle.needle, needle.steering)
     if not 0.0 < target[1] <= reach:
         raise ParameterError(
             f'--target: the depth must be in (0, {1e3 * reach:g}] mm with the needle '
@@ -136,12 +136,12 @@ def sample_needle(
 
 
 def run(options: argparse.Namespace) -> int:
-    nominal = dynamics.find_needle(options.needle)
-    target = _target(options, nominal)
-    depths, aim = step_depths(target[1], options.step, name='--step'), target[[0, 2]]
     changes = common.constants(options.set)
     check_names('', changes, (*CONSTANTS, *DIAMETERS))
-    needle, steering, _ = nominal.changed(changes)
+    nominal = dynamics.find_needle(options.needle).changed(changes)
+    target = _target(options, nominal)
+    depths, aim = step_depths(target[1], options.step, name='--step'), target[[0, 2]]
+    needle, steering, _ = nominal
     prior = from_values(SteeringPrior, common.constants(options.prior, '--prior'))
     errors = from_values(simulation.SteppedTipErrors, common.constants(options.sensor, '--sensor'))
     limits = replace(
