@@ -76,9 +76,10 @@ def of_tube(values: Mapping[str, Any]) -> dict[str, Any]:
         for name in DIAMETERS
     )
     if not (is_number(outer) and is_number(inner) and 0.0 <= inner < outer <= _WIDEST):
+        hint = ' (in mm?)' if is_number(outer) and outer > _WIDEST else ''
         raise ParameterError(
             f'outer_diameter and inner_diameter must be 0 <= inner < outer <= {_WIDEST:g} m, got '
-            f'{outer!r} and {inner!r}: 0.7mm is a length, too'
+            f'{outer!r}{hint} and {inner!r}'
         )
     if clash := [name for name in ('area', 'area_moment') if name in others]:
         raise ParameterError(f'{clash[0]} is given by the diameters, too: omit one of them')

@@ -86,7 +86,10 @@ def test_parameter_file_of_nodes_is_a_needle(tmp_path: Path) -> None:
         ),
         ('outer_diameter: 3N\n', "mine.yaml: '3N' is not a length"),
         ('inner_diameter: 1mm\n', 'must be 0 <= inner < outer <= 0.02 m, got 0.0 and'),
-        ('outer_diameter: 0.7\n', 'must be 0 <= inner < outer <= 0.02 m, got 0.7 and'),
+        (
+            'outer_diameter: 0.7\n',
+            'must be 0 <= inner < outer <= 0.02 m, got 0.7 (in mm?) and 0.0',
+        ),
         ('outer_diameter: 1mm\narea: 1mm^2\n', 'area is given by the diameters, too'),
         ('outer_diamter: 1mm\n', "did you mean 'outer_diameter'"),
         ('a: [', 'mine.yaml is not YAML'),
