@@ -145,7 +145,7 @@ def read_steering_recording(
         motion: EachJoint(*(name for _, name in joints.values()), *tilts),
     }
     gathered, _ = reading.read_samples(bag, sources, time)
-    _, tips, moved, _ = merge(bag, gathered[tip].samples(bag), gathered[motion].samples(bag))
+    at, tips, moved, _ = merge(bag, gathered[tip].samples(bag), gathered[motion].samples(bag))
     losses = list(bag.losses)
     for name, column in zip(tilts, moved[:, len(joints) :].T, strict=True):
         if (change := float(np.ptp(column))) > _MOVED:
@@ -153,7 +153,15 @@ def read_steering_recording(
     both = np.hstack([tips, moved[:, : len(joints)]])
     signs = [sign for sign, _ in (*axes.values(), *joints.values())]
     values = dict(zip([*axes, *joints], (both * signs).T, strict=True))
-    return recorded_insertion(path, medium, values, losses, f'is {joints["depth"][1]} in m?')
+    advice = f'is {joints["depth"][1]} in m?'
+    found = recorded_insertion(path, medium, values, losses, advice)
+    if not (again := _second_insertion(found.depth)):
+        return found
+    # Samples are left out at the start only.
+    count = again + len(at) - len(found.depth)
+    losses.append(f'a second insertion begins {at[count]:.3g} s after the start, left out')
+    values = {role: column[:count] for role, column in values.items()}
+    return recorded_insertion(path, medium, values, losses, advice)
 
 
 def _of_table(path: Path, columns: Mapping[str, str], medium: str) -> SteeringRecording:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 from scipy.io import savemat
+from support.steered_recording import recorded_plant
 
 
 def written(path: Path, names: str, columns: FloatArray) -> Path:
@@ -215,3 +216,20 @@ def test_a_needle_of_more_than_1_m_is_an_error(
         read_steering_recording(path, columns={'depth': spec})
     right = {'depth': words.partition('depth=')[2].rstrip("'") or 'd[mm]'}
     assert read_steering_recording(path, columns=right).depth.max() < 0.2
+
+
+def test_second_insertion_of_a_bag_is_left_out(tmp_path: Path) -> None:
+    """With its time; the needle would follow the path that it has cut before."""
+    once, twice = (
+        read_steering_recording(recorded_plant(tmp_path / str(again), 1, twice=again))
+        for again in (False, True)
+    )
+    (words,) = (loss for loss in twice.losses if 'insertion begins' in loss)
+    found = re.fullmatch(r'a second insertion begins ([.0-9]+) s after the start, left out', words)
+    assert found
+    # The period of the tracker, its delay, and a lost reading.
+    assert float(found[1]) == pytest.approx(18.0, abs=0.1)
+    assert not any('insertion begins' in loss for loss in once.losses)
+    deepest = int(np.argmax(once.depth > 0.099))
+    assert_allclose(twice.depth[:deepest], once.depth[:deepest], atol=1e-9)
+    assert twice.depth[-1] < 0.01

@@ -11,11 +11,14 @@ from needle_dynamics.simulated.run import Event, PlantRun, TRAJECTORY
 from needle_identification.bags.writer import BagWriter
 
 
-def recorded_plant(folder: Path, seed: int, names: Mapping[str, str] | None = None) -> Path:
+def recorded_plant(
+    folder: Path, seed: int, names: Mapping[str, str] | None = None, *, twice: bool = False
+) -> Path:
     """
     Record a steered plant with a moving guide and an EM tracker.
 
-    Joints may have other names, with the opposite sign of another robot.
+    Joints may have other names, with the opposite sign of another robot. The needle may be
+    withdrawn and inserted again.
     """
     values = {
         'steered': True, 'mode': 'robot', 'needle': 'bending_35mm', 'rate': 200.0,
@@ -25,12 +28,13 @@ def recorded_plant(folder: Path, seed: int, names: Mapping[str, str] | None = No
     plant, path = PlantRun(values), folder / f'run_{seed}'
     joints, times = ('insertion', 'guide_x', 'guide_z'), [1.0, 5.0, 6.0, 12.0]
     positions = [[0.01, 3e-3, 0.0], [0.045, 3e-3, -2e-3], [0.05, -1e-3, -2e-3], [0.1, 0.0, 2e-3]]
-    plant.perform(
-        Event(
-            TRAJECTORY,
-            {'joints': joints, 'times': times, 'positions': positions, 'efforts': [[]] * 4},
-        )
-    )
+    if twice:
+        times += [18.0, 25.0]
+        positions += [[0.005, 0.0, 0.0], [0.09, -3e-3, 2e-3]]
+    course = {
+        'joints': joints, 'times': times, 'positions': positions, 'efforts': [[]] * len(times),
+    }  # fmt: skip
+    plant.perform(Event(TRAJECTORY, course))
     topics = {
         name: replace(
             topic,
@@ -42,7 +46,7 @@ def recorded_plant(folder: Path, seed: int, names: Mapping[str, str] | None = No
     with BagWriter(path) as bag:
         for name, topic in topics.items():
             bag.add_topic(f'/{name}', topic.type_name)
-        for k in range(1, 2500):
+        for k in range(1, 5200 if twice else 2500):
             stamp = 1_700_000_000_000_000_000 + k * 5_000_000
             for name, age, numbers in plant.take(stamp):
                 if name == 'joint_states' and names:
