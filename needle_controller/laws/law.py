@@ -23,7 +23,7 @@ from needle_controller.reference.setpoint import Setpoint
 from needle_dynamics import FloatArray, Friction, NeedleParameters
 from needle_dynamics.compiled.friction import decay_means, friction_flow
 from needle_ros.errors import ParameterError
-from needle_ros.settings import CheckedSettings
+from needle_ros.settings import CheckedSettings, constant
 import numpy as np
 
 #: Coulomb friction is compensated in the direction of the desired velocity this much later [s], or
@@ -67,8 +67,8 @@ class Axis(Friction):
     """Insertion (SI: kg, N, N s/m) or rotation (kg m^2, N m, N m s): a mass with friction."""
 
     inertia: float  #: [kg] or [kg m^2]
-    coulomb: float = 0.0
-    viscous: float = 0.0
+    coulomb: float = constant(0.0, 'N', 'Coulomb friction mu_s')
+    viscous: float = constant(0.0, 'N s/m', 'viscous friction mu_v')
 
     def __post_init__(self) -> None:
         # Without arguments, super does not work in a dataclass with slots.

@@ -79,7 +79,7 @@ class Series:
     def losses(self, name: str) -> list[str]:
         """Return the repaired, discarded and missing data of the topic `name`."""
         steps = np.diff(self.stamps)
-        gaps = steps[are_gaps(steps)]
+        gaps = steps[are_gaps(steps)] if len(steps) else steps
         places = '1 place' if len(gaps) == 1 else f'{len(gaps)} places'
         return [
             words

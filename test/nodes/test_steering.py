@@ -455,7 +455,7 @@ def test_invalid_targets_and_parameters_are_rejected(ros_graph: RosGraph) -> Non
     assert 'out of reach' in bench.status.last_rejection
     for name, value, complaint in (
         ('speed', 0.0, 'speed must be finite, > 0 m/s, got 0.0'),
-        ('prior.noise', 0.0, 'prior.noise must be finite, > 0 m, got 0.0'),
+        ('prior.noise', 0.0, 'prior.noise must be finite, > 0 and <= 0.1 m, got 0.0'),
         ('model.tissue_stiffness', 'soft', "with a unit of N/m^2, Pa, kPa, MPa, got 'soft'"),
         ('steering.path_noise', 0.1, "unknown parameter 'steering.path_noise'"),
         ('turns', 0.5, 'turns must be a whole number, got 0.5'),
