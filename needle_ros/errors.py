@@ -5,7 +5,7 @@ from typing import Final
 
 _LONGEST: Final = 500  #: Maximum length of a log line [characters].
 
-#: Python modules of ROS 2 besides those of its messages.
+#: Python modules of ROS 2 except messages.
 _ROS: Final = {'rclpy', 'launch', 'launch_ros', 'domain_coordinator', 'ament_index_python'}
 
 

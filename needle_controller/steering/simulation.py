@@ -58,8 +58,8 @@ def sample_truth(
     """
     Sample a true needle: uniform in the spread of the prior, normal in its deviations.
 
-    The factors of the layers are log-normal; the load of the bevel is that of the layer with the
-    largest nominal load.
+    The factors of the layers are log-normal; the sampled load of the bevel acts in the layer with
+    the largest nominal load.
     """
     length, skin = (1.0 + prior.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
     sizes = prior.tilt, prior.frame, prior.bevel
@@ -183,7 +183,7 @@ def simulate_steering(
     Insert a simulated needle in steps: measure the tip, plan, move guide and roll, insert.
 
     ``sensor`` returns a measurement of the tip, shape (2,) [m], or None. ``watch`` is called after
-    each step. ``roll`` is that of the needle at the start as given to the law [rad]. Raises
+    each step. ``roll`` is the initial roll of the needle as given to the law [rad]. Raises
     `SteeringFaultError` if the law stops the insertion or exceeds ``limits``, if they are given,
     and `LawError` if it fails.
     """

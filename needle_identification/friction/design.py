@@ -106,7 +106,7 @@ class Design:
         return regressors(motion, terms, signals.settings)
 
     def column_noise(self, terms: Sequence[str]) -> FloatArray | None:
-        """Return the change of terms by a standard deviation of the velocity noise, if any."""
+        """Return the change of the used rows by a standard deviation of velocity noise, if any."""
         noise = self.signals.velocity_noise
         if noise == 0.0 or OF_VELOCITY.isdisjoint(terms):
             return None

@@ -100,7 +100,7 @@ class SlicerPlanner:
         self._job: tuple[Job[Any], Callable[[Job[Any]], None]] | None = None
 
     def take_segmentation(self, frame: Frame) -> None:
-        """Replace the segmentation by that of a message."""
+        """Replace the segmentation."""
         self._frame, self._anatomies, self._planned = frame, (), False
         self.close()
 
@@ -200,7 +200,7 @@ class SlicerPlanner:
         self._report(line, severity)
 
     def _failed(self, line: str) -> str:
-        """Forget the needle of an earlier plan; return a line that tells that it is shown."""
+        """Forget the needle of an earlier plan; return a line with a note if it is shown."""
         self.shape = None
         return line + '; the needle shown is of an earlier plan' * self._shown
 

@@ -159,7 +159,7 @@ def test_shape_of_a_straight_plan_is_its_line(seed: int) -> None:
     np.testing.assert_array_equal(faces[:, 1:], shape.triangles)
 
 
-def test_other_needle_than_that_of_the_plan_is_one_line() -> None:
+def test_needle_that_differs_from_the_plan_is_one_line() -> None:
     plan = plan_of(np.zeros(3), np.array([0.0, 0.0, -1.0]), displaced=1e-3)
     with pytest.raises(ParameterError, match='is not the one of the plan: its tip ends') as error:
         plan_files.planned_shape(plan)

@@ -146,7 +146,9 @@ def test_the_suggested_command_succeeds_with_others_at_rest(
     # Messages, not the averages of 2.5 ms that are kept of a fast topic; these begin and end up to
     # 2.5 ms within the first and last message, of more than 10 s.
     assert rates['/ft'] == pytest.approx(1000.0, rel=1e-3)
-    assert rates['/joints'] == pytest.approx(250.0 * len(content.get('robots', '1')), rel=1e-3)
+    assert rates['/joints'] == pytest.approx(
+        250.0 * len(content.get('robots', ONE_ROBOT)), rel=1e-3
+    )
     assert run(found.command) == 0
     assert '0.56' in capsys.readouterr().out
 

@@ -14,6 +14,7 @@ import sys
 from typing import Any
 
 from benchmarks.igtl_peer import free_port, Peer, Told
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped
 from needle_insertion.slicer.link import Frame, Frames, HEADER, LARGEST
@@ -22,10 +23,12 @@ from needle_insertion.slicer.slicer_node import SlicerNode
 from needle_planning import read_plan, write_plan
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.status import LEVELS, read_reports, SlicerPhase, SlicerStatus
+from needle_ros.timing import nanoseconds
 import numpy as np
 import pyigtl
 from pyigtl.messages import MessageBase
 import pytest
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from support.anatomies import plan_of
 from support.ros_graph import RosGraph
@@ -414,6 +417,32 @@ def test_target_flood_is_reported_once_and_the_newest_is_used(
         times = [float(line.split('[')[2].split(']')[0]) for line in lines if words in line]
         assert times
         assert all(later - earlier > 0.9 for earlier, later in pairwise(times))
+
+
+def test_targets_while_simulated_time_stands_still_are_two_requests(room: Room) -> None:
+    """The stamp identifies a request; the second would get the answer of the first."""
+    node = room.slicer(use_sim_time=True)
+    clock = room.probe.create_publisher(Clock, '/clock', 10)
+    room.until(lambda: room.status().phase is SlicerPhase.WAITING, 'the node')
+    visitor = Visitor(room)
+
+    def send(depth: float) -> int:
+        """Send a target, and return its stamp [ns]."""
+        at = ' '.join(map(repr, REGISTRATION.to_image([0.0, depth, 0.0]).tolist()))
+        visitor.send(room, pyigtl.StringMessage(at, device_name='TARGET').pack())
+        room.until(lambda: depth in depths(), f'the target at {depth} m')
+        return depths()[depth]
+
+    def depths() -> dict[float, int]:
+        return {round(one.point.y, 3): nanoseconds(one.header.stamp) for one in room.targets}
+
+    def stands() -> bool:
+        clock.publish(Clock(clock=Time(sec=5)))
+        return bool(node.get_clock().now().nanoseconds == 5_000_000_000)
+
+    room.until(stands, 'the time')
+    with closing(visitor.socket):
+        assert [send(0.06), send(0.07)] == [5_000_000_000, 5_000_000_001]
 
 
 def test_port_in_use_is_reported_and_retried(room: Room) -> None:

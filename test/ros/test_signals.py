@@ -49,8 +49,8 @@ def test_signal_before_the_end_of_the_block_is_handled() -> None:
         signal.signal(signal.SIGTERM, previous)
 
 
-@pytest.mark.skipif(not hasattr(os, 'sched_setaffinity'), reason='Linux only')
-def test_cores_are_those_that_the_process_may_use() -> None:
+def test_cores_are_those_that_the_process_may_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without an affinity, as on macOS, all of the machine."""
     before = os.sched_getaffinity(0)
     try:
         os.sched_setaffinity(0, {min(before)})
@@ -58,3 +58,5 @@ def test_cores_are_those_that_the_process_may_use() -> None:
     finally:
         os.sched_setaffinity(0, before)
     assert cores() == len(before)
+    monkeypatch.delattr(os, 'sched_getaffinity')
+    assert cores() == os.cpu_count()

@@ -278,6 +278,15 @@ def test_noisier_measurement_reduces_uncertainty_less() -> None:
             use()
 
 
+def test_error_of_a_target_out_of_reach_crosses_processes() -> None:
+    with pytest.raises(OutOfReachError) as caught:
+        MultiHypothesisLaw(MODEL, (0.04, 0.0), LIMITS)
+    found = pickle.loads(pickle.dumps(caught.value))  # noqa: S301
+    assert str(found) == str(caught.value)
+    for ours, theirs in zip(found.reach, caught.value.reach, strict=True):
+        assert_array_equal(ours, theirs)
+
+
 def test_number_of_measurements_is_not_limited() -> None:
     """Ten measurements at each of three depths, with and without space for them at the start."""
     model = SteeringModel(NEEDLE, STEERING, DEPTHS[:3], SteeringPrior(drift=0.0))
