@@ -31,6 +31,7 @@ from needle_controller import (
     SafetyLimits,
 )
 from needle_controller.gains import LAWS
+from needle_controller.reference.quintic import PEAK_SPEED
 from needle_controller.steering.motion import smooth
 from needle_dynamics import NeedleParameters
 from needle_dynamics.simulated.run import Event, PARAMETERS
@@ -53,7 +54,7 @@ WINDOW: Final = 0.01
 
 #: Start and target of the insertion [m], and duration of the path between them at the limit [s].
 START, TARGET = 0.02, 0.05
-_DURATION: Final = 1.875 * (TARGET - START) / (0.999 * LIMIT)
+_DURATION: Final = PEAK_SPEED * (TARGET - START) / (0.999 * LIMIT)
 
 #: Longest time that a suspended plant computes later [s].
 _BACKLOG: Final = 0.05

@@ -23,7 +23,7 @@ from needle_controller.stability import (
     Uncertainty,
 )
 from needle_dynamics import NeedleParameters
-from needle_ros.contract import INSERTION
+from needle_ros.contract import INSERTION, ROTATION
 from needle_ros.errors import ParameterError
 from needle_ros.settings import CheckedSettings, constant, flag, positive
 from needle_ros.status import ControllerStatus
@@ -115,20 +115,15 @@ class Measurement(NamedTuple):
     @classmethod
     def from_reading(cls, reading: Reading) -> Measurement:
         """Convert a joint state to a measurement; `rotation` and efforts may be missing."""
-        names, (positions, velocities, efforts) = reading.names, reading.values
-        try:
-            i = names.index('insertion')
-            depth, velocity = positions[i], velocities[i]
-            angle = angular_velocity = 0.0
-            if 'rotation' in names:
-                j = names.index('rotation')
-                angle, angular_velocity = positions[j], velocities[j]
-        except (ValueError, IndexError):
+        found = reading.joint(INSERTION)
+        positions, velocities, _ = reading.values
+        if found is None or min(len(positions), len(velocities)) < len(reading.names):
             raise ParameterError(
                 "joint_states needs position and velocity of 'insertion', got names "
-                f'{list(names)}, {len(positions)} positions, {len(velocities)} velocities'
-            ) from None
-        force = efforts[i] if i < len(efforts) else nan
+                f'{list(reading.names)}, {len(positions)} positions, {len(velocities)} velocities'
+            )
+        depth, velocity, force = found
+        angle, angular_velocity, _ = reading.joint(ROTATION) or (0.0, 0.0, nan)
         time = reading.stamp / NANOSECONDS
         return cls(time, depth, velocity, angle, angular_velocity, force)
 

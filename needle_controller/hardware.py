@@ -223,19 +223,15 @@ class Robot:
         The force is NaN if it is not reported, or with position commands. A missing joint,
         position, or velocity for efforts is a `ParameterError`.
         """
-        settings, names = self.settings, reading.names
-        positions, velocities, efforts = reading.values
-        i = self._find(settings.joint, reading)
-        depth = self.length(positions[i])
-        velocity = self._gain * velocities[i] if i < len(velocities) else nan
+        settings = self.settings
+        position, speed, effort = self._find(settings.joint, reading)
+        depth, velocity = self.length(position), self._gain * speed
         time = reading.stamp / NANOSECONDS
         angle = angular_velocity = 0.0
         force = nan
         if settings.command == POSITION:
             if not self._others:
-                self._others = {
-                    joint: positions[self._find(joint, reading)] for joint in settings.joints
-                }
+                self._others = {joint: self._find(joint, reading)[0] for joint in settings.joints}
             if isnan(velocity):
                 velocity, self.estimates = self._speed.update(time, depth), True
         else:
@@ -245,28 +241,25 @@ class Robot:
                     '(ros2_control: a state interface for velocity), hardware.command position '
                     'does not'
                 )
-            if i < len(efforts):
-                force = self.force(efforts[i])
-            if settings.command_type == 'wrench' and ROTATION in names:
-                j = names.index(ROTATION)
-                if j < min(len(positions), len(velocities)):
-                    angle, angular_velocity = positions[j], velocities[j]
+            force = self.force(effort)
+            if settings.command_type == 'wrench' and (found := reading.joint(ROTATION)):
+                angle, angular_velocity, _ = found
         base = None
         if self._base is not None and settings.command == POSITION and isfinite(depth):
             base = self._base.state(depth)
         return Measurement(time, depth, velocity, angle, angular_velocity, force, base)
 
-    def _find(self, joint: str, reading: Reading) -> int:
-        names, positions = reading.names, reading.values[0]
-        i = names.index(joint) if joint in names else len(positions)
-        if i >= len(positions) or isnan(positions[i]):
-            there = [repr(name) for name, one in zip(names, positions, strict=False) if one == one]
+    def _find(self, joint: str, reading: Reading) -> tuple[float, float, float]:
+        state = reading.joint(joint)
+        if state is None or isnan(state[0]):
+            values = zip(reading.names, reading.values[0], strict=False)
+            there = [repr(name) for name, one in values if one == one]
             found = ', '.join(there) or 'none'
             raise ParameterError(
                 f'joint_states has no position of the joint {joint!r}; positions found: {found} '
                 '(hardware.joint, hardware.command_joints)'
             )
-        return i
+        return state
 
     def wrench(self, reading: Reading) -> Reading:
         """Convert a force sensor reading to the axes of ``needle_base``, about its own origin."""

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from math import nan
 import sys
 from time import monotonic
 from typing import Any, ClassVar, Final
@@ -284,13 +283,10 @@ class IdentificationNode(BaseNode):
 
     def _on_motion(self, reading: Reading) -> None:
         sign, joint = self._joint
-        if self._live is None or joint not in reading.names:
-            return
-        at = reading.names.index(joint)
-        position, velocity, _ = reading.values
-        if len(position) > at:
-            along = sign * velocity[at] if len(velocity) > at else nan
-            self._live.take_motion(reading.stamp, sign * position[at], along)
+        found = reading.joint(joint)
+        if self._live is not None and found is not None:
+            position, velocity, _ = found
+            self._live.take_motion(reading.stamp, sign * position, sign * velocity)
 
     def _on_force(self, reading: Reading) -> None:
         if self._live is not None:

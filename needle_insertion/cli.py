@@ -16,7 +16,7 @@ from types import FrameType, ModuleType
 from typing import Any, Final, NoReturn
 
 from needle_insertion.report.made import COMMAND
-from needle_ros.errors import JobError, missing_ros, NeedleError
+from needle_ros.errors import JobError, missing_ros, NeedleError, ParameterError
 from needle_ros.process import ENDINGS
 
 #: Help text of each subcommand; key: its module in `needle_insertion.commands`, or in `ABOVE`.
@@ -75,7 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except (NeedleError, OSError) as error:
         sys.stderr.write(f'error: {error}\n')
-        return 1 if isinstance(error, JobError) else 2
+        invalid = isinstance(error, ParameterError) or not isinstance(error, JobError)
+        return 2 if invalid else 1
     except KeyboardInterrupt:
         sys.stderr.write('interrupted\n')
         return 130

@@ -36,6 +36,9 @@ AXES: Final = ('x', 'y', 'z')  #: Axes of a frame, in the order of message field
 
 NORMAL: Final = 1.96  #: Half width of a 95 % interval of a normal quantity [standard deviations].
 
+#: Standard deviation of a normal quantity over the median of its absolute deviations.
+DEVIATION_OVER_MEDIAN: Final = 1.4826
+
 
 def accepted_units(unit: str) -> str:
     """Return the units of text for a quantity in an SI unit, separated by commas."""

@@ -13,6 +13,7 @@ import sys
 import textwrap
 import time
 from types import FrameType
+from typing import Final
 
 from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.errors import NeedleError
@@ -29,6 +30,8 @@ from rclpy.utilities import remove_ros_args
 
 #: Environment variable: a node ends with its parent process, of this process ID (1: any parent).
 END_WITH_PARENT = 'NEEDLE_END_WITH_PARENT'
+
+INVALID_INPUT: Final = 2  #: Exit status of a node that rejects its parameters or arguments.
 
 _SIGNALS, _HOUR = 0.02, 3600.0  #: Period of the check for signals, and longest spin [s].
 
@@ -73,7 +76,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
             # rcl raises RuntimeError for invalid arguments or parameter files, and for a node that
             # SROS2 rejects.
             sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
-            return 2
+            return INVALID_INPUT
         _read_files(node)
         spinning = True
         status = _spin(node, lambda: stopping)
@@ -100,7 +103,7 @@ def _spin(node: BaseNode, stopping: Callable[[], bool]) -> int:
         nonlocal status
         # Publish the reason on /diagnostics.
         node.publish_diagnostics()
-        status = 2
+        status = INVALID_INPUT
         ended.set_result(None)
 
     # A signal is handled at the next callback.

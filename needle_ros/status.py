@@ -24,6 +24,7 @@ TASK: Final = 'state'  #: Task in the name of the status of a node: ``/plant: st
 HARDWARE: Final = 'needle'  #: Hardware of nodes without a namespace; else the namespace.
 LEVELS: Final = ('OK', 'WARN', 'ERROR', 'STALE')  #: Names of the levels of a DiagnosticStatus.
 STALE: Final = bytes([3])  #: Level STALE of a DiagnosticStatus: its values are no longer updated.
+SILENT: Final = 5.0  #: Timeout of the status of a node, which is published every second [s].
 _KIND: Final = 'kind'  #: Key of the kind of a status.
 _MISSING: Final = object()  #: Result of a field that is missing or invalid in a status.
 

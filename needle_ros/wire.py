@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import count
+from math import nan
 import struct
 from typing import Any, Final, NamedTuple
 
@@ -69,6 +70,14 @@ class Reading(NamedTuple):
     #: Positions, velocities and efforts of a JointState; else one tuple of all numbers, in the
     #: order of the fields.
     values: tuple[tuple[float, ...], ...]
+
+    def joint(self, name: str) -> tuple[float, float, float] | None:
+        """Return position, velocity and effort of a joint, NaN if missing; None without it."""
+        if name not in self.names:
+            return None
+        k = self.names.index(name)
+        position, velocity, effort = [one[k] if k < len(one) else nan for one in self.values]
+        return position, velocity, effort
 
 
 class _Cursor:

@@ -2,6 +2,7 @@
 """Motions of least integrated squared jerk: polynomials of fifth order in time."""
 
 from math import inf, sqrt
+from typing import Final
 
 from needle_controller.compiled.quintic import quintic_extremes
 from needle_controller.reference.setpoint import (
@@ -15,6 +16,11 @@ from needle_controller.reference.setpoint import (
 )
 from needle_dynamics import FloatArray
 import numpy as np
+
+PEAK_SPEED: Final = 15.0 / 8.0  #: Highest speed of a quintic from rest to rest over its mean.
+
+#: Highest acceleration of such a quintic, times its squared duration over its distance.
+PEAK_ACCELERATION: Final = 10.0 / sqrt(3.0)
 
 
 class Quintic(Reference):
@@ -71,10 +77,9 @@ class Quintic(Reference):
 
 def shortest(distance: float, limits: ReferenceLimits) -> float:
     """Return the duration [s] of the fastest quintic from rest to rest over a distance [m]."""
-    # The peaks of the quintic are 15/8 D/T and 10/sqrt(3) D/T^2.
     return max(
-        1.875 * distance / limits.speed,
-        sqrt(10.0 / sqrt(3.0) * distance / limits.acceleration),
+        PEAK_SPEED * distance / limits.speed,
+        sqrt(PEAK_ACCELERATION * distance / limits.acceleration),
         SHORTEST,
     )
 

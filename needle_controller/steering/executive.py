@@ -116,6 +116,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         self._motions = MotionControl(settings, self.events)
         self.keeper = RecordKeeper()  #: record of the insertion, for an executive after a restart
         self._tip: tuple[float, ...] | None = None  #: the newest reading of the tip [m]
+        self._deepest = 0.0  #: largest insertion depth so far [m]
         #: The latest insertion, and the retraction after it.
         self._insertion: SteppedInsertion | None = None
         self._retraction: Retraction | None = None
@@ -244,6 +245,12 @@ class SteeringExecutive(StateMachine[JointMotion]):
         begins = f'is resumed in step {guarded.step}' if guarded.step else 'begins'
         line = f'insertion to {describe_target(point)} in {len(depths) - 1} steps {begins}'
         self.events.add(Severity.INFO, line)
+        if not guarded.step and self._deepest > at[0] + settings.tolerances[0]:
+            self.events.add(
+                Severity.WARNING,
+                f'a needle was {1e3 * self._deepest:.1f} mm deep before: in the same tissue this '
+                'one may follow the old path',
+            )
         return self._insertion.begin(at, now)
 
     def _obstacle(self, word: str, _now: int) -> str:
@@ -313,16 +320,19 @@ class SteeringExecutive(StateMachine[JointMotion]):
 
     def joints(self, reading: Reading, now: int) -> JointMotion | None:
         """Process `joint_states`."""
-        found = dict(zip(reading.names, reading.values[0], strict=False))
-        if missing := [name for name in self.settings.joints if name not in found]:
-            got = f'got names {list(reading.names)}'
-            self.events.reject(f'joint_states lacks a position of {", ".join(missing)}, {got}')
+        states = [reading.joint(name) for name in self.settings.joints]
+        at = [state[0] for state in states if state is not None]
+        if len(at) < len(states) or not reading.values[0]:
+            self.events.reject(
+                f'joint_states needs positions of {", ".join(self.settings.joints)}, got names '
+                f'{list(reading.names)}, {len(reading.values[0])} positions'
+            )
             return None
-        at = [found[name] for name in self.settings.joints]
         if not self._is_valid(self._joint_stream, reading, at, now):
             return None
         motions, stamp = self._motions, reading.stamp
         motions.measure(np.array(at), stamp)
+        self._deepest = max(self._deepest, at[0])
         if self.phase is Phase.STOPPED:
             return motions.stop_again(stamp, now)
         if self._obeyed is Mode.PAUSED:

@@ -18,11 +18,10 @@ from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_ros.errors import ParameterError
 from needle_ros.event_log import EventLog, Severity
-from needle_ros.quantities import NORMAL
+from needle_ros.quantities import DEVIATION_OVER_MEDIAN, NORMAL
 import numpy as np
 
 _OUTLIER: Final = 5.0  #: Distance of an outlier from the median, in standard deviations.
-_OVER_MEDIAN: Final = 1.4826  #: Standard deviation over the median of absolute deviations.
 _FEW: Final = 3  #: Least number of readings for outlier rejection.
 
 SAME: Final = 1e-6  #: Tolerance of equal positions [m, rad].
@@ -63,7 +62,8 @@ class TipMeasurements:
         kept: BoolArray = np.ones(len(tips), dtype=np.bool_)
         if len(tips) >= _FEW:
             off = np.abs(tips - basis @ _fitted(basis, tips))
-            scatter = np.maximum(_OVER_MEDIAN * np.median(off, axis=0), noise * sqrt(len(tips)))
+            scatter = DEVIATION_OVER_MEDIAN * np.median(off, axis=0)
+            scatter = np.maximum(scatter, noise * sqrt(len(tips)))
             kept = np.asarray((off <= _OUTLIER * scatter).all(axis=1))
             if kept.sum() < basis.shape[1]:
                 return AveragedTipMeasurement(_fitted(basis, tips)[0], 0.0, 1, frozen=False)

@@ -146,6 +146,10 @@ def failed_law(law: SteeringLaw, what: str) -> LawError:
 def find_law(name: str) -> LawClass:
     """Return the class of a law: a key of `STEERING_LAWS`, or a class as ``module:Class``."""
     found: LawClass = find_class('law', name, STEERING_LAWS)
+    needed = [one for one, part in vars(SteeringLaw).items() if one[0] != '_' and callable(part)]
+    missing = [one for one in needed if not hasattr(found, one)]
+    if missing:
+        raise ParameterError(f'law {name!r} is no steering law: it lacks {", ".join(missing)}')
     return found
 
 

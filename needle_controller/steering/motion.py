@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import ceil, sqrt
 from typing import Final, NamedTuple
 
-from needle_controller.reference.quintic import Quintic
+from needle_controller.reference.quintic import PEAK_ACCELERATION, PEAK_SPEED, Quintic
 from needle_controller.reference.setpoint import Setpoint
 from needle_controller.steering.settings import ExecutiveSettings
 from needle_dynamics.arrays import BoolArray, FloatArray
@@ -15,11 +15,8 @@ from needle_ros.requests import Acknowledgement, REPEAT_AFTER, REPEATS, RequestS
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
-_PEAK: Final = 1.875  #: Highest speed of a smooth motion from rest to rest over its mean.
-
-#: Highest acceleration of such a motion, times its squared duration over its distance; cubics
-#: between its points add 5 %.
-_STEEPEST: Final = 1.05 * 10.0 / sqrt(3.0)
+#: `PEAK_ACCELERATION` of a motion in points: the cubics between them add 5 %.
+_STEEPEST: Final = 1.05 * PEAK_ACCELERATION
 
 _POINTS: Final = 20, 1000  #: Fewest and most points of a motion.
 _INTERVAL: Final = 0.05  #: Time from one point of a motion to the next within these bounds [s].
@@ -58,9 +55,9 @@ def duration_of(shift: FloatArray, settings: ExecutiveSettings) -> float:
     """Return the shortest duration [s] of a smooth motion of the joints by a shift [m, rad]."""
     along, across = float(abs(shift[0])), float(np.hypot(shift[1], shift[2]))
     return max(
-        _PEAK * along / settings.speed,
-        _PEAK * across / settings.guide_speed,
-        _PEAK * float(np.abs(shift[3:]).sum()) / settings.roll_speed,
+        PEAK_SPEED * along / settings.speed,
+        PEAK_SPEED * across / settings.guide_speed,
+        PEAK_SPEED * float(np.abs(shift[3:]).sum()) / settings.roll_speed,
         sqrt(_STEEPEST * max(along, across) / settings.acceleration),
     )
 

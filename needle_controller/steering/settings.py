@@ -57,7 +57,7 @@ class SteeringLimits:
         5e-3, 'm', 'insertion from one tip measurement to the next', open_low=True
     )
     guide_limit: float = constant(
-        6e-3, 'm', 'largest position of the guide along x and along z; 0: it stays at 0'
+        6e-3, 'm', 'largest position of the guide along x and along z; 0: it stays at 0', high=0.1
     )
     guide_step: float = constant(
         2e-3, 'm', 'largest change of the guide from one step to the next along x and along z',

@@ -35,6 +35,7 @@ from needle_identification.errors import IdentificationError
 from needle_identification.estimation import ESTIMATORS
 from needle_identification.estimation.memory import divided, Memory, memory_of
 from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.quantities import DEVIATION_OVER_MEDIAN
 from needle_ros.settings import check_choice
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,8 +49,7 @@ LARGEST_CONDITION: Final = 20.0
 _LARGEST_SHARE: Final = 0.1  # largest share of such a direction in a determined parameter
 _ROUNDING: Final = 1e-9  # relative size of rounding errors
 _PRIOR: Final = 5.0  # weight of the noise of all groups in each group [correlation windows]
-_HUBER_LIMIT: Final = 1.345  # residual over its deviation of falling weight; 95 % efficient
-DEVIATION_OVER_MEDIAN: Final = 1.4826  #: standard over median deviation, normal
+HUBER_LIMIT: Final = 1.345  # residual over its deviation of falling weight; 95 % efficient
 _MAX_ITERATIONS: Final = 100
 
 
@@ -284,7 +284,7 @@ def _huber(x: FloatArray, y: FloatArray, used: BoolArray) -> _Solution:
     limit = np.inf
     for _ in range(_MAX_ITERATIONS):
         size = np.abs(y - x @ values)
-        limit = _HUBER_LIMIT * max(DEVIATION_OVER_MEDIAN * float(np.median(size[used])), smallest)
+        limit = HUBER_LIMIT * max(DEVIATION_OVER_MEDIAN * float(np.median(size[used])), smallest)
         weights = np.where(size > limit, limit / np.maximum(size, limit), 1.0) * used
         last, values = values, _weighted(x, y, weights).values
         if np.linalg.norm(values - last) <= _ROUNDING * np.linalg.norm(values):

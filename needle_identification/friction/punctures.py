@@ -16,9 +16,9 @@ from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import ParameterEstimate, with_half_width
 from needle_identification.estimation.memory import stretches
-from needle_identification.estimation.regression import DEVIATION_OVER_MEDIAN, Regression
+from needle_identification.estimation.regression import Regression
 from needle_identification.friction.design import Design
-from needle_ros.quantities import NORMAL
+from needle_ros.quantities import DEVIATION_OVER_MEDIAN, NORMAL
 import numpy as np
 
 _CLEAR: Final = 8.0  # smallest drop [standard deviations of other changes of the force]

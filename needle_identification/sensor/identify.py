@@ -22,7 +22,6 @@ from needle_identification.estimation.estimate import (
     named,
     ParameterEstimate,
 )
-from needle_identification.estimation.regression import DEVIATION_OVER_MEDIAN
 from needle_identification.recordings.recording import SensorRecording
 from needle_identification.recordings.samples import are_gaps
 from needle_identification.sensor.checks import axis_warnings, EXACT, measured_rows
@@ -34,7 +33,7 @@ from needle_identification.sensor.noise import (
     NoiseLikelihood,
     RATIOS,
 )
-from needle_ros.quantities import NORMAL
+from needle_ros.quantities import DEVIATION_OVER_MEDIAN, NORMAL
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import stdtrit

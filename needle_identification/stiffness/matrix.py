@@ -20,9 +20,10 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.estimation.estimate import measured, ParameterEstimate, with_half_width
-from needle_identification.estimation.regression import regress
+from needle_identification.estimation.regression import HUBER_LIMIT, regress
 from needle_identification.stiffness.plateaus import ROUNDING
 from needle_identification.stiffness.presses import Presses, PressNoise
+from needle_ros.quantities import DEVIATION_OVER_MEDIAN
 import numpy as np
 from numpy.linalg import norm
 from numpy.typing import ArrayLike
@@ -154,7 +155,7 @@ def _deviation(
     # P. J. Huber, "Robust Statistics", 1981, section 7.6; a clipped residual is not free.
     if estimator != 'huber':
         return sqrt(float(residual @ residual) / freedom), freedom, residual
-    limit = 1.345 * 1.4826 * float(np.median(np.abs(residual)))
+    limit = HUBER_LIMIT * DEVIATION_OVER_MEDIAN * float(np.median(np.abs(residual)))
     left = np.clip(residual, -limit, limit)
     share = float(np.mean(np.abs(residual) <= limit))
     count = len(residual)

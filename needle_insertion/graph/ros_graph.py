@@ -11,6 +11,7 @@ from itertools import filterfalse
 from math import inf
 import os
 from pathlib import Path
+import re
 import signal
 import subprocess
 import sys
@@ -22,10 +23,10 @@ from domain_coordinator import domain_id
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from needle_insertion.nodes import NODES
-from needle_ros.errors import JobError
+from needle_ros.errors import JobError, ParameterError
 from needle_ros.network import claim, domain_of, is_claimed, LOCAL, stay_local
 from needle_ros.process import DeferredSignals, ONE_THREAD
-from needle_ros.run_node import end, END_WITH_PARENT
+from needle_ros.run_node import end, END_WITH_PARENT, INVALID_INPUT
 from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import Executor
@@ -44,11 +45,18 @@ _START: Final = 180.0  #: Timeout of the start of a node, with compilation on a 
 #: Time after which a client that is not ready for a discovered service is replaced [s].
 _CLIENT: Final = 3.0
 _REQUEST: Final = 0.2  #: Period of the requests for the state of a node [s].
+#: Severity, time and name at the begin of a line of a log, or the word of another output.
+_LOG_PREFIX: Final = re.compile(r'\[\w+\] \[[\d.]+\] \[[^]]*\]: |error: ')
+
 _PATIENCE: Final = 3.0  #: Timeout of the clean end of the nodes, before they are killed [s].
 
 
 class GraphError(JobError):
     """A node did not start, ended early, or timed out."""
+
+
+class InvalidNodeError(ParameterError, GraphError):
+    """A node rejected its parameters or arguments."""
 
 
 class NodeProcess:
@@ -87,10 +95,17 @@ class NodeProcess:
         )
 
     def check(self) -> None:
-        """Raise `GraphError` with the last line of output if the node has ended, once."""
+        """
+        Raise `GraphError` with the last line of output if the node has ended, once.
+
+        `InvalidNodeError` if it has rejected its parameters.
+        """
         status = self.process.poll()
         if status is not None and not self.ended:
             self.ended = True
+            if status == INVALID_INPUT:
+                line = _LOG_PREFIX.sub('', self.last_line)
+                raise InvalidNodeError(f'{self.name}: {line or "invalid parameters"}')
             raise GraphError(
                 f'{self.name} ended early with status {status}: {self.last_line or "no output"}'
             )

@@ -29,6 +29,7 @@ from needle_ros.status import (
     ControllerStatus,
     LEVELS,
     RecorderStatus,
+    SILENT,
     SteeringPhase,
     SteeringStatus,
 )
@@ -43,8 +44,6 @@ _NEAR: Final = 5e-4  #: Largest distance of a needle at its target [m].
 #: Timeout of a stop [s], and velocity below which the needle rests [m/s].
 _BRAKING: Final = 2.0
 _REST: Final = 1e-4
-
-_SILENT: Final = 5.0  #: Timeout of the status of a node, which is published every second [s].
 
 #: Sensors without which a node rejects all targets.
 _NEEDED: Final = (
@@ -100,8 +99,8 @@ class Warnings:
         for name, state in states.items() if now >= self.quiet else ():
             report = state.report
             level, words = report.level, f'{report.level_name} {report.message}'
-            if state.age > _SILENT:
-                level, words = _ERROR, f'ERROR no status for {_SILENT:g} s'
+            if state.age > SILENT:
+                level, words = _ERROR, f'ERROR no status for {SILENT:g} s'
             # A changed number is not a new warning.
             kind = re.sub(r'\d+', '', words)
             again = level >= _ERROR or now - self._printed.get((name, kind), -inf) > _AGAIN
@@ -244,8 +243,8 @@ class Terminal(Cmd):
         pending = self._operator.target(x, y, z)
 
         def answered() -> bool:
-            if pending.answer is not None and self._state(aims).age > _SILENT:
-                raise JobError(f'{aims}: no status for {_SILENT:g} s')
+            if pending.answer is not None and self._state(aims).age > SILENT:
+                raise JobError(f'{aims}: no status for {SILENT:g} s')
             return pending.done
 
         self._await(answered, f'the answer of {aims}')
@@ -280,8 +279,8 @@ class Terminal(Cmd):
             if now != last:
                 last, since = now, monotonic()
             # Time may be halted by a user, without a fault.
-            if status.fault and monotonic() - since > _SILENT:
-                raise JobError(f'no measurement for {_SILENT:g} s: {status.fault}')
+            if status.fault and monotonic() - since > SILENT:
+                raise JobError(f'no measurement for {SILENT:g} s: {status.fault}')
             rests = self._readings.reference_rests_at(status.target)
             arrived = min(arrived, now) if rests else inf
             away = self._readings.distance(status.target)

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 from needle_dynamics.arrays import FloatArray
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.settings import check_constants, constant
-from needle_ros.status import NodeReport
+from needle_ros.status import NodeReport, SILENT
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
@@ -26,9 +26,8 @@ LINE: Final = 'line from guide to tip, not measured'
 
 _PERIOD: Final = 1.0  #: time between two transmissions, unless something changes [s]
 
-#: Largest number of nodes, and ages of a silent and of a removed node [s].
+#: Largest number of nodes, and age of a removed node [s].
 _MOST: Final = 20
-_SILENT: Final = 5.0
 _REMOVED: Final = 60.0
 
 
@@ -219,6 +218,6 @@ class NodeStates:
         lines = []
         for name, (when, level, message) in self._states.items():
             age = now - when
-            silent = f', silent for {age:.0f} s' if age > _SILENT else ''
+            silent = f', silent for {age:.0f} s' if age > SILENT else ''
             lines.append(f'{name} [{level}{silent}]: {message}')
         return lines

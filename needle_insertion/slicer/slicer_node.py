@@ -179,11 +179,11 @@ class SlicerNode(BaseNode):
             self._view.take_poses(stamp, points, turn, monotonic())
 
     def _on_joints(self, reading: Reading) -> None:
-        found = dict(zip(reading.names, reading.values[0], strict=False))
-        if contract.INSERTION not in found:
+        if reading.joint(contract.INSERTION) is None:
             return
         # A guide without joints is at the entry point.
-        x, z = found.get(contract.GUIDE_X, 0.0), found.get(contract.GUIDE_Z, 0.0)
+        at_x, at_z = reading.joint(contract.GUIDE_X), reading.joint(contract.GUIDE_Z)
+        x, z = (0.0 if state is None else state[0] for state in (at_x, at_z))
         with self._rejecting(contract.JOINT_STATES):
             self._view.take_guide(x, z, monotonic())
 

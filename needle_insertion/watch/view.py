@@ -10,7 +10,7 @@ from needle_dynamics import FloatArray
 from needle_ros import contract
 from needle_ros.quantities import NORMAL
 from needle_ros.settings import is_number
-from needle_ros.status import ControllerStatus, NodeReport, SteeringStatus
+from needle_ros.status import ControllerStatus, NodeReport, SILENT, SteeringStatus
 from needle_ros.wire import Reading
 import numpy as np
 
@@ -28,7 +28,6 @@ _LIMITS: Final = {
 
 RATE: Final = 30.0  #: frames per second
 SPAN: Final = 20.0  #: duration of the history [s]
-_SILENT_NODE: Final = 3.0  #: timeout of the status of a node, which is published every second [s]
 
 #: Largest number of points of a line, and of nodes.
 _POINTS: Final = 120
@@ -114,9 +113,8 @@ def _joint(topic: contract.Topic, joint: str, part: int = 0) -> Signal:
     """Return position, velocity or effort (part 0, 1 or 2) of a joint as a signal."""
 
     def of(reading: Reading) -> float | None:
-        values = reading.values[part]
-        k = reading.names.index(joint) if joint in reading.names else len(values)
-        return number(values[k]) if k < len(values) else None
+        found = reading.joint(joint)
+        return None if found is None else number(found[part])
 
     return Signal(topic.name, of)
 
@@ -325,7 +323,7 @@ class View:
                     'level': report.level,
                     'words': report.message,
                     'age': round(age, 1),
-                    'silent': age > _SILENT_NODE,
+                    'silent': age > SILENT,
                     'last_rejection': getattr(typed, 'last_rejection', ''),
                 }
             )

@@ -105,8 +105,16 @@ def test_own_law_steers_in_a_study() -> None:
         ('mine', r"law must be one of multi_hypothesis, springs, .* module:Class, got 'mine'$"),
         ('steering_law:Other', "'steering_law:Other' cannot be imported: .* 'Other'$"),
         ('no_such_module:Law', "'no_such_module:Law' cannot be imported: No module named"),
-        ('needle_controller:SteeringPrior', "'needle_controller:SteeringPrior' cannot be constr"),
-        ('types:SimpleNamespace', 'cannot be constructed: '),
+        (
+            'needle_controller:SteeringPrior',
+            "'needle_controller:SteeringPrior' is no steering law",
+        ),
+        (
+            'types:SimpleNamespace',
+            'is no steering law: it lacks aim, update, plan, expected, status',
+        ),
+        ('os:system', "law 'os:system' is no steering law: it lacks aim, update,"),
+        ('needle_controller:GuideLaw', 'cannot be constructed: '),
     ],
 )
 def test_invalid_law_is_rejected_in_one_line(

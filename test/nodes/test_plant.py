@@ -17,7 +17,7 @@ from needle_dynamics import FloatArray
 from needle_dynamics.plant_node import PlantNode
 from needle_dynamics.simulated.force_sensor import ForceSensorParameters
 from needle_dynamics.simulated.indenter import IndenterParameters
-from needle_insertion.graph.ros_graph import GraphError
+from needle_insertion.graph.ros_graph import InvalidNodeError
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.requests import Verdict
 from needle_ros.status import PlantStatus
@@ -267,11 +267,11 @@ def test_shipped_parameter_file_is_valid(
 def test_invalid_parameters_end_the_process(
     ros_graph: RosGraph, parameters: dict[str, Any], complaint: str
 ) -> None:
-    """With a one-line error and status 2."""
+    """With a one-line error, which the graph repeats, and status 2."""
     plant = ros_graph.start('plant', parameters)
     assert plant.process.wait(30) == 2
     assert complaint in plant.last_line
-    with pytest.raises(GraphError, match='ended early with status 2'):
+    with pytest.raises(InvalidNodeError, match=f'^plant: .*{complaint}'):
         plant.check()
 
 

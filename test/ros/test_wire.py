@@ -91,6 +91,11 @@ def test_template_round_trip_matches_rosbags(
     assert reading is not None
     assert reading[:3] == (stamp, 'needle_base', tuple(names))
     assert_array_equal(np.concatenate(reading.values), [*position, *velocity])
+    for k, name in enumerate(names):
+        if name not in names[:k]:
+            given_values = [one[k] if k < len(one) else np.nan for one in (position, velocity, ())]
+            assert_array_equal(reading.joint(name), given_values)
+    assert reading.joint('a name of more than five characters') is None
     assert template.serialize(stamp, *position, *velocity) == message
     if little:
         counts = len(position), len(velocity), 0

@@ -492,6 +492,19 @@ def test_target_after_a_retraction_is_accepted() -> None:
     assert robot.loop.steers
 
 
+def test_second_insertion_warns_of_the_old_path() -> None:
+    """The first does not."""
+    robot = Robot()
+    said: list[str] = []
+    for _ in range(2):
+        robot.steer()
+        said.append(' '.join(line for _, line in robot.loop.events.take()))
+        robot.ways[0] = robot.now + np.array([0.0, 1e9]), np.array([robot.at[0], 0.0])
+        robot.tick(120)
+    assert 'may follow the old path' not in said[0]
+    assert 'a needle was 60.0 mm deep before: in the same tissue' in said[1]
+
+
 def test_settings_incompatible_with_continuous_are_rejected() -> None:
     with pytest.raises(ParameterError, match='turns must be 0 if continuous'):
         ExecutiveSettings(continuous=True, turns=2)
