@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run the command line `needle`: exit status 0 success, 1 failed job, 2 invalid usage or input."""
+"""
+Run the command line `needle`.
+
+Exit status: 0 success, 1 failed job, 2 invalid usage or input, 128 + the number of a signal.
+"""
 
 import argparse
 from codecs import register_error
 from collections.abc import Iterator, Mapping, Sequence
+import errno
 from importlib import import_module
 from io import TextIOWrapper
 import os
@@ -49,6 +54,9 @@ ABOVE: Final[Mapping[str, str]] = {
 
 _ROOT: Final = Path(__file__).parents[1]
 
+#: Errors of a disk, with any input.
+_DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+
 #: ASCII substitutes of table characters, by character.
 _PLAIN: Final = {'±': '+-', '−': '-', '–': '-'}
 
@@ -75,14 +83,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except (NeedleError, OSError) as error:
         sys.stderr.write(f'error: {error}\n')
-        invalid = isinstance(error, ParameterError) or not isinstance(error, JobError)
-        return 2 if invalid else 1
-    except KeyboardInterrupt:
+        return _status(error)
+    except KeyboardInterrupt as error:
         sys.stderr.write('interrupted\n')
-        return 130
+        return 128 + int(error.args[0] if error.args else signal.SIGINT)
     finally:
         for name, handler in previous.items():
             signal.signal(name, handler)
+
+
+def _status(error: NeedleError | OSError) -> int:
+    if isinstance(error, OSError):
+        return 1 if error.errno in _DISK else 2
+    return 1 if isinstance(error, JobError) and not isinstance(error, ParameterError) else 2
 
 
 def _plain(error: UnicodeError) -> tuple[str, int]:
@@ -117,11 +130,11 @@ def _run(words: list[str]) -> int:
     return status
 
 
-def _interrupt(_signal: int, _frame: FrameType | None) -> NoReturn:
+def _interrupt(number: int, _frame: FrameType | None) -> NoReturn:
     # A second signal must not interrupt the clean-up.
     for name in ENDINGS:
         signal.signal(name, signal.SIG_IGN)
-    raise KeyboardInterrupt
+    raise KeyboardInterrupt(number)
 
 
 def _load(name: str) -> ModuleType:

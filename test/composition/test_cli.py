@@ -294,6 +294,17 @@ def test_closed_stream_has_no_effect_on_the_other(closed: str, other: str, tmp_p
     assert file.read_text('utf-8').count('\n') > 100
 
 
+def test_full_disk_is_a_failed_job() -> None:
+    """In one line; the input is valid."""
+    with Path('/dev/full').open('w', encoding='utf-8') as full:
+        done = subprocess.run(
+            [sys.executable, '-m', 'needle_insertion.cli', 'steer', '--json'],
+            stdout=full, stderr=subprocess.PIPE, text=True, timeout=300.0, check=False,
+        )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr == 'error: [Errno 28] No space left on device\n'
+
+
 def test_terminal_without_unicode_shows_a_result() -> None:
     """Unsupported characters are replaced."""
     done = run('identify', 'friction', BAGS[0], PYTHONIOENCODING='ascii')

@@ -328,8 +328,8 @@ def fill_disk(running: Session) -> None:
 #: Cause of the end of a session, exit status, and last line.
 CAUSES: Mapping[str, tuple[Callable[[Session], object], int, str]] = {
     'SIGINT': (send(signal.SIGINT), 130, 'interrupted'),
-    'SIGTERM': (send(signal.SIGTERM), 130, 'interrupted'),
-    'SIGHUP': (send(signal.SIGHUP), 130, 'interrupted'),
+    'SIGTERM': (send(signal.SIGTERM), 143, 'interrupted'),
+    'SIGHUP': (send(signal.SIGHUP), 129, 'interrupted'),
     'error in the script': (
         lambda running: running.say('wait now'),
         2,

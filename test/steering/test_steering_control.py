@@ -462,7 +462,7 @@ def test_invalid_input_is_rejected() -> None:
         MultiHypothesisLaw(MODEL, (0.0, 0.1, 0.0), LIMITS)
     with pytest.raises(ParameterError, match='target must be finite'):
         MultiHypothesisLaw(MODEL, (0.0, np.inf), LIMITS)
-    with pytest.raises(ParameterError, match='guide_limit must be finite, >= 0 and <= 0.1 m'):
+    with pytest.raises(ParameterError, match=r'guide_limit must be finite, >= 0 and <= 0\.1 m'):
         SteeringLimits(guide_limit=-1.0)
     with pytest.raises(ParameterError, match='guide_limit and turns cannot both be 0'):
         MultiHypothesisLaw(MODEL, (0.0, 0.0), SteeringLimits(guide_limit=0.0))
