@@ -7,14 +7,14 @@ coefficients frozen at the operating point.
 """
 
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import inf
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.friction import Friction
 from needle_dynamics.model import NeedleModel
-from needle_ros.errors import NeedleError, ParameterError
-from needle_ros.settings import check_choice
+from needle_ros.errors import NeedleError
+from needle_ros.settings import check_choice, checked
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -140,8 +140,7 @@ def linearize(
     from scipy.linalg import eigh
 
     for name, number in (('force', force), ('torque', torque), ('time', time)):
-        if not isfinite(number):
-            raise ParameterError(f'{name} must be finite, got {number!r}')
+        checked(name, number)
     p, x, m = model.parameters, model.checked_state(state), model.coordinates
     modal, d_rate, rate = x[2:m], x[m], x[m + 2 :]
     depth = p.length - x[0]

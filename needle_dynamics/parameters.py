@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
-from math import ceil, expm1, inf
+from math import ceil, expm1
 from typing import Any, Final
 
 from needle_dynamics.compiled.tissue import Layers
@@ -16,6 +16,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import (
     check_constants,
     check_whole,
+    checked,
     choice,
     constant,
     flag,
@@ -71,8 +72,7 @@ class Tissue:
 
     def growth(self, time: float) -> float:
         """Return the factor of the stiffness by swelling at a time of at least 0 [s]."""
-        if not 0.0 <= time < inf:
-            raise ParameterError(f'time must be finite and >= 0 s, got {time!r}')
+        checked('time', time, 's', low=0.0)
         return 1.0 - self.swelling * expm1(-time / self.swelling_time)
 
     def layer(self, depth: float) -> int:

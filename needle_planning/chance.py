@@ -21,7 +21,7 @@ from needle_ros.errors import missing_extra, ParameterError
 from needle_ros.files import read_yaml
 from needle_ros.process import cores
 from needle_ros.process_pool import processes
-from needle_ros.settings import check_whole, is_number
+from needle_ros.settings import check_whole, checked
 from needle_study.distribution import from_table
 from needle_study.scenario import check_names, mapping
 from needle_study.study import build_study, Study
@@ -219,8 +219,7 @@ def chance_of(
     count = cores() if workers is None else workers
     check_whole('workers', count, 1, MOST_INSERTIONS)
     check_whole('shafts', shafts, 0, insertions)
-    if not is_number(radius) or radius <= 0.0:
-        raise ParameterError(f'radius must be > 0 m, got {radius!r}')
+    checked('radius', radius, 'm', low=0.0, open_low=True)
     # Imported here: it imports Numba.
     from needle_planning.plan_scenario import write_inputs
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import inf, isfinite
+from math import isfinite
 from typing import Any, Final, TypeAlias
 
 from needle_controller.steering.insertion_plan import guide_axes, in_layers, Plan
@@ -28,7 +28,7 @@ from needle_planning.paths import (
 )
 from needle_planning.search import disc_region, EntryRegion, Lines, search_lines, voxel_region
 from needle_ros.errors import JobError, ParameterError
-from needle_ros.settings import is_number
+from needle_ros.settings import checked
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -169,12 +169,9 @@ class _Planner:
         resolution: float,
     ) -> None:
         self.anatomies, self.target = anatomies, _point('target', target)
-        if not is_number(resolution) or not resolution >= _FINEST:
-            raise ParameterError(f'resolution must be >= {_FINEST:g} m, got {resolution!r}')
-        if not (is_number(skin_limit) or skin_limit == inf) or skin_limit < 0.0:
-            raise ParameterError(f'skin_limit must be >= 0 m, got {skin_limit!r}')
+        checked('skin_limit', skin_limit, 'm', low=0.0, unlimited=True)
         self.name, self.limits, self.roll, self.skin_limit = needle, limits, roll, skin_limit
-        self.resolution = float(resolution)
+        self.resolution = checked('resolution', resolution, 'm', low=_FINEST)
         self.preset = _usable(needle)
         self.radius = needle_radius(self.preset.needle)
         self.reach = longest_insertion(self.preset.needle, self.preset.steering)
@@ -427,8 +424,7 @@ def _region(
     anatomies: Sequence[Anatomy], target: FloatArray, entry: str | ArrayLike | None, radius: float
 ) -> EntryRegion:
     if entry is not None and not isinstance(entry, str):
-        if not is_number(radius) or radius < 0.0:
-            raise ParameterError(f'entry_radius must be >= 0 m, got {radius!r}')
+        checked('entry_radius', radius, 'm', low=0.0)
         point = _point('entry', entry)
         if not np.linalg.norm(target - point) > radius:
             raise ParameterError(

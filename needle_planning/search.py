@@ -27,7 +27,7 @@ from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_dynamics.simulated.batch import thread_count
 from needle_planning.anatomy import Anatomy
 from needle_planning.clearance import Clearance, image_frame, ImageFrame, LineClearance, NO_BOW
-from needle_ros.errors import ParameterError
+from needle_ros.settings import checked
 import numpy as np
 
 _FIRST: Final = 16e-3  #: Size of the first cells [m].
@@ -210,8 +210,7 @@ def search_lines(
         search finds no line with a positive clearance, c is at most h.
 
     """
-    if not resolution > 0.0:
-        raise ParameterError(f'resolution must be > 0 m, got {resolution:g} m')
+    checked('resolution', resolution, 'm', low=0.0, open_low=True)
     search = _Search(clearance, target, reach, resolution, bow)
     centers, radius, size = region.centers, region.radius, _FIRST
     while len(centers):

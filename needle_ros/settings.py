@@ -172,22 +172,36 @@ def check_whole(name: str, value: object, low: int, high: int) -> None:
         raise ParameterError(f'{name} must be an integer from {low} to {high}, got {value!r}')
 
 
-def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
+def checked(
+    name: str,
+    value: object,
+    unit: str = '1',
+    *,
+    low: float = -inf,
+    high: float = inf,
+    open_low: bool = False,
+    unlimited: bool = False,
+) -> float:
+    """Return a number as a float; raise `ParameterError` outside its range, as of `constant`."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ParameterError(f'{name} must be a number, got {value!r}')
     if isinstance(value, int) and not is_number(value):
         raise ParameterError(f'{name} must be finite, got an integer of too many digits')
-    too_low = value <= meta['low'] if meta['open_low'] else value < meta['low']
-    infinite = not isfinite(value) and not (meta['unlimited'] and value == inf)
-    if infinite or too_low or value > meta['high']:
-        finite = '' if meta['unlimited'] else 'finite, '
-        sign = '>' if meta['open_low'] else '>='
-        upper = f' and <= {meta["high"]:g}' if isfinite(meta['high']) else ''
-        raise ParameterError(
-            f'{name} must be {finite}{sign} {meta["low"]:g}{upper}'
-            f'{" " + meta["unit"] if meta["unit"] != "1" else ""}, got {value!r}'
-        )
-    if meta['whole'] and value != int(value):
+    infinite = not isfinite(value) and not (unlimited and value == inf)
+    if infinite or (value <= low if open_low else value < low) or value > high:
+        lower = f'{">" if open_low else ">="} {low:g}' if isfinite(low) else ''
+        upper = f'<= {high:g}' if isfinite(high) else ''
+        limits = ' and '.join(filter(None, (lower, upper)))
+        rule = ', '.join(filter(None, ('' if unlimited else 'finite', limits)))
+        of = '' if unit == '1' or not limits else f' {unit}'
+        raise ParameterError(f'{name} must be {rule}{of}, got {value!r}')
+    return float(value)
+
+
+def _check_number(name: str, value: object, meta: Mapping[str, Any]) -> None:
+    limits = {key: meta[key] for key in ('low', 'high', 'open_low', 'unlimited')}
+    number = checked(name, value, meta['unit'], **limits)
+    if meta['whole'] and number != int(number):
         of = '' if meta['unit'] == '1' else f' of {meta["unit"]}'
         raise ParameterError(f'{name} must be a whole number{of}, got {value!r}')
 

@@ -10,7 +10,7 @@ from needle_controller.laws.law import BREAKAWAY_TIME
 from needle_dynamics import FloatArray, NeedleModel
 from needle_dynamics.arrays import floats
 from needle_ros.errors import ParameterError, ShapeError
-from needle_ros.settings import check_choice
+from needle_ros.settings import check_choice, checked
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -109,10 +109,7 @@ class ContinuousInverseDynamics(ContinuousLaw):
 
     def __post_init__(self) -> None:
         check_choice('actuation', self.actuation, ACTUATIONS)
-        if not 0.0 <= self.breakaway_speed < inf:
-            raise ParameterError(
-                f'breakaway_speed must be finite and >= 0 m/s, got {self.breakaway_speed!r}'
-            )
+        checked('breakaway_speed', self.breakaway_speed, 'm/s', low=0.0)
         kp, kv = (_gain_matrix(name, getattr(self, name), self.driven) for name in ('kp', 'kv'))
         object.__setattr__(self, '_gains', (kp, kv))
 

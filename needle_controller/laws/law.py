@@ -23,7 +23,7 @@ from needle_controller.reference.setpoint import Setpoint
 from needle_dynamics import FloatArray, Friction, NeedleParameters
 from needle_dynamics.compiled.friction import decay_means, friction_flow
 from needle_ros.errors import ParameterError
-from needle_ros.settings import CheckedSettings, constant
+from needle_ros.settings import checked, CheckedSettings, constant
 import numpy as np
 
 #: Coulomb friction is compensated in the direction of the desired velocity this much later [s], or
@@ -73,8 +73,7 @@ class Axis(Friction):
     def __post_init__(self) -> None:
         # Without arguments, super does not work in a dataclass with slots.
         Friction.__post_init__(self)
-        if not 0.0 < self.inertia < inf:
-            raise ParameterError(f'inertia must be finite and > 0, got {self.inertia!r}')
+        checked('inertia', self.inertia, low=0.0, open_low=True)
 
     @classmethod
     def insertion(cls, parameters: NeedleParameters) -> Axis:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
+from math import inf
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -16,7 +17,7 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.errors import ParameterError
 from needle_ros.files import read_yaml, write_whole
-from needle_ros.settings import is_number
+from needle_ros.settings import checked
 import numpy as np
 import yaml
 
@@ -181,10 +182,8 @@ def _value(name: str, item: str, value: object, shapes: Mapping[str, tuple[int, 
     if item in ('needle', 'structure'):
         if not isinstance(value, str):
             raise ParameterError(f'{name} must be text, got {value!r}')
-    elif not is_number(value):
-        raise ParameterError(f'{name} must be a number, got {value!r}')
-    elif item in _DISTANCES and value < 0.0:
-        raise ParameterError(f'{name} must be >= 0 m, got {value!r}')
+    else:
+        checked(name, value, 'm', low=0.0 if item in _DISTANCES else -inf)
     return value
 
 

@@ -4,7 +4,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, nan
+from math import inf, nan
 from reprlib import repr as shortened
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
@@ -15,7 +15,7 @@ from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.steering.needle import SteeredNeedle
 from needle_ros.errors import JobError, NeedleError, ParameterError, ShapeError
 from needle_ros.quantities import NORMAL
-from needle_ros.settings import find_class
+from needle_ros.settings import checked, find_class
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -203,12 +203,6 @@ def build_law(
     return law
 
 
-def checked_roll(roll: float) -> float:
-    if not isfinite(roll):
-        raise ParameterError(f'roll must be finite, got {roll!r} rad')
-    return roll
-
-
 def checked_tip(tip: ArrayLike | None, name: str = 'a tip measurement') -> FloatArray:
     """Return a tip measurement x, z [m], nan if it is missing."""
     found = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
@@ -237,7 +231,7 @@ class GuideLaw(ABC):
         self, model: SteeringModel, target: ArrayLike, limits: SteeringLimits, roll: float = 0.0
     ) -> None:
         self.depths, self.limits = model.depths, limits
-        self.turns, self.roll = limits.turns, checked_roll(roll)
+        self.turns, self.roll = limits.turns, checked('roll', roll)
         self._nominal = SteeredNeedle(model.needle, model.steering, roll=self.roll)
         self.step = 0
         self.guides = [np.zeros(2)]  #: guide at each depth so far [m], at last its setpoint

@@ -19,7 +19,7 @@ from needle_dynamics.errors import InsertionDepthError
 from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 from needle_ros.errors import NeedleError, ParameterError, ShapeError
-from needle_ros.settings import is_number
+from needle_ros.settings import checked
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -182,6 +182,4 @@ def not_completed(model: NeedleModel, state: FloatArray, left: float) -> NeedleE
 
 def checked_step(step: float) -> float:
     """Check a longest step [s] and return it as a float."""
-    if not is_number(step) or step < SHORTEST_STEP:
-        raise ParameterError(f'step must be finite and >= {SHORTEST_STEP:g} s, got {step!r} s')
-    return float(step)
+    return checked('step', step, 's', low=SHORTEST_STEP)

@@ -17,6 +17,7 @@ from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.integrator import checked_step, not_completed, SHORTEST_STEP
 from needle_ros.errors import ParameterError
+from needle_ros.settings import checked
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -182,7 +183,8 @@ def simulate(
             f'order must be {ORDERS[0]} unless friction_law is {FRICTION_LAWS[COULOMB]}, '
             f'got {order!r} and {parameters.friction_law}'
         )
-    tolerance = checked_tolerance(DEFAULT_TOLERANCE if tolerance is None else tolerance)
+    tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
+    checked('tolerance', tolerance, low=0.0, open_low=True)
     if interval is None:
         if callable(force):
             raise ParameterError('interval must be given with a force that is a function of time')
@@ -267,13 +269,6 @@ def _difference(model: NeedleModel, one: FloatArray, two: FloatArray) -> float:
     return max(
         float(np.abs(two[:, 0] - one[:, 0]).max()) / farthest, apart / peak if peak else apart
     )
-
-
-def checked_tolerance(tolerance: float) -> float:
-    """Check a tolerance and return it as a float."""
-    if not 0.0 < tolerance < inf:
-        raise ParameterError(f'tolerance must be positive and finite, got {tolerance!r}')
-    return float(tolerance)
 
 
 def count_of(duration: float, interval: float) -> int:

@@ -13,7 +13,7 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import Placement, SteeredNeedle
 from needle_dynamics.steering.parameters import by_layer, SteeringParameters
 from needle_ros.errors import ParameterError
-from needle_ros.settings import is_number
+from needle_ros.settings import checked
 import numpy as np
 
 DEFAULT_AXIS_STEP = 1e-4  #: default step along the axis [s]
@@ -94,8 +94,7 @@ class Insertion(Displayed):
         step: float = DEFAULT_AXIS_STEP,
         seed: int = 0,
     ) -> None:
-        if not is_number(step) or step <= 0.0:
-            raise ParameterError(f'step must be positive and finite, got {step!r} s')
+        checked('step', step, 's', low=0.0, open_low=True)
         #: Lateral model of the needle.
         self.needle = SteeredNeedle(needle, steering, seed=seed)
         self.change(needle)

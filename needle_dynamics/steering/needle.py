@@ -3,7 +3,7 @@
 
 from collections.abc import Sequence
 from math import ceil, exp, isfinite, sqrt
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray, floats
 from needle_dynamics.compiled.beam import SpringSupports
@@ -34,7 +34,7 @@ from needle_dynamics.steering.parameters import (
     turning_load,
 )
 from needle_ros.errors import ParameterError
-from needle_ros.settings import is_number
+from needle_ros.settings import checked
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -182,7 +182,7 @@ class SteeredNeedle(Displayed):
         self._cut = empty_cut(needle.length, self._constants.element, len(self._constants.starts))
         self._boxed = Boxed(CuttingNeedle(self._constants, self._cut))
         self._placement = Placement(
-            _pair('guide', guide), _pair('tilt', tilt), _finite('roll', roll), np.zeros(3)
+            _pair('guide', guide), _pair('tilt', tilt), checked('roll', roll), np.zeros(3)
         )
         start(self._constants, self._cut, self._pose(0.0), self.steering.free_length)
 
@@ -221,7 +221,7 @@ class SteeredNeedle(Displayed):
         this method twice. ``tissue`` is the displacement of the tissue with its path in x, y and z
         [m], which precedes the motion. ParameterError if a value is not valid.
         """
-        to = self.depth if depth is None else _finite('depth', depth)
+        to = self.depth if depth is None else checked('depth', depth)
         placement = self.checked(guide, tilt, roll, tissue)
         lowest, reach = placement.tissue[1], self.needle.length - self.steering.free_length
         if not lowest <= to <= reach:
@@ -261,7 +261,7 @@ class SteeredNeedle(Displayed):
         return Placement(
             now.guide if guide is None else _pair('guide', guide),
             now.tilt if tilt is None else _pair('tilt', tilt),
-            now.roll if roll is None else _finite('roll', roll),
+            now.roll if roll is None else checked('roll', roll),
             shift,
         )
 
@@ -366,12 +366,6 @@ def inserted_shape(needle: SteeredNeedle, points: FloatArray) -> tuple[FloatArra
         u + t * (2.0 * bend + 3.0 * t * twist), h, out=slopes[i].copy(), where=h > 0.0
     )
     return values, turns
-
-
-def _finite(name: str, value: Any) -> float:
-    if not is_number(value):
-        raise ParameterError(f'{name} must be a finite number, got {value!r}')
-    return float(value)
 
 
 def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:

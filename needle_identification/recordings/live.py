@@ -2,7 +2,7 @@
 """The newest samples of running topics as a recording."""
 
 from collections import Counter
-from math import inf, isfinite, nan
+from math import isfinite, nan
 from typing import Final
 
 from needle_dynamics.arrays import IntArray
@@ -11,7 +11,7 @@ from needle_identification.recordings.merging import merged_recording
 from needle_identification.recordings.recording import Recording
 from needle_identification.recordings.samples import position_and_velocity, Samples, Series
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES
-from needle_ros.errors import ParameterError
+from needle_ros.settings import checked
 from needle_ros.timing import NANOSECONDS
 import numpy as np
 
@@ -60,9 +60,7 @@ class LiveRecording:
     path: Final = 'the running topics'
 
     def __init__(self, window: float) -> None:
-        if not 0.0 < window < inf:
-            raise ParameterError(f'window must be finite and > 0, got {window!r}')
-        self._window = window * NANOSECONDS
+        self._window = checked('window', window, 's', low=0.0, open_low=True) * NANOSECONDS
         #: Number of discarded samples by reason.
         self.dropped: Counter[str] = Counter()
         #: Discarded and repaired data of the last recording; stamps since the start.

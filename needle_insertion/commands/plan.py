@@ -21,7 +21,7 @@ from needle_planning.paths import SKIN_LIMIT
 from needle_planning.planner import find_plan, RESOLUTION
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import point
-from needle_ros.settings import check_whole, LARGEST_SEED
+from needle_ros.settings import check_whole, checked, LARGEST_SEED
 import numpy as np
 
 if TYPE_CHECKING:
@@ -202,8 +202,7 @@ def _simulation(options: argparse.Namespace) -> Callable[..., Chance] | None:
 
     check_whole('--insertions', options.insertions, 0, MOST_INSERTIONS)
     check_whole('--seed', options.seed, 0, LARGEST_SEED)
-    if not options.radius > 0.0:
-        raise ParameterError(f'--radius must be > 0 m, got {options.radius:g} m')
+    checked('--radius', options.radius, 'm', low=0.0, open_low=True)
     given: dict[str, Any] = {}
     if options.population is not None:
         given['population'], given['correlations'] = read_population(options.population)

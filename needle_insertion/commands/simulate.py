@@ -21,6 +21,7 @@ from needle_insertion.progress import ProgressLine, Show
 from needle_insertion.report import trajectory as report
 from needle_insertion.report.content import table
 from needle_ros.errors import ParameterError
+from needle_ros.settings import checked
 from needle_study.scenario import check_names
 import numpy as np
 
@@ -211,8 +212,7 @@ def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
     needle, steering, _ = dynamics.find_needle(needle_name).changed(changes)
     to = _TO if options.to is None else options.to
     speed = _SPEED if options.speed is None else options.speed
-    if not _SLOWEST <= speed < inf:
-        raise ParameterError(f'--speed must be finite and >= {_SLOWEST:g} m/s, got {speed!r} m/s')
+    checked('--speed', speed, 'm/s', low=_SLOWEST)
     interval = _STEP / speed if options.interval is None else options.interval
     start = 0.0 if options.depth is None else options.depth
     if start > needle.length:

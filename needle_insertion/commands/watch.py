@@ -7,7 +7,6 @@ import argparse
 import asyncio
 from contextlib import suppress
 from functools import partial
-from math import isfinite
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ from needle_controller.steering.insertion_plan import Plan, read_plan
 from needle_insertion.commands.common import add_flag, add_quantity, add_time, print_each
 from needle_ros.errors import ParameterError
 from needle_ros.process import ENDINGS
+from needle_ros.settings import checked
 
 if TYPE_CHECKING:
     # Takes long to import.
@@ -72,8 +72,8 @@ def run(options: argparse.Namespace) -> int:
         raise ParameterError('--control needs a live insertion: omit --control or the BAG')
     if options.shift is not None and options.other is None:
         raise ParameterError('--shift needs two recordings: add OTHER, or omit --shift')
-    if options.shift is not None and not isfinite(options.shift):
-        raise ParameterError(f'--shift must be finite, got {options.shift} s')
+    if options.shift is not None:
+        checked('--shift', options.shift, 's')
     given = bool(options.anatomy), options.labels is not None
     if any(given) and not (all(given) and options.plan is not None):
         raise ParameterError('--anatomy needs --plan and --labels, and --labels needs --anatomy')

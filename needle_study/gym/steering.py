@@ -4,7 +4,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from math import atan2, ceil, exp, inf, sqrt
+from math import atan2, ceil, exp, sqrt
 from typing import Any, ClassVar, Final
 
 from gymnasium import spaces
@@ -26,6 +26,7 @@ from needle_dynamics.compiled.lane_rows import LANES
 from needle_dynamics.steering.needle import empty_cut, steered, wandering
 from needle_dynamics.steering.parameters import by_layer, with_bevel
 from needle_ros.errors import ParameterError
+from needle_ros.settings import checked
 from needle_study.gym.environment import NeedleEnv, NeedleVectorEnv, picture
 from needle_study.gym.pushed import BOUND
 from needle_study.gym.steered import (
@@ -61,8 +62,7 @@ class _Needles:
         names = 'depth', 'step_length', 'guide_limit', 'aside'
         sizes = dict(zip(names, (depth, step_length, guide_limit, aside), strict=True))
         for name, value in sizes.items():
-            if not 0.0 < value < inf:
-                raise ParameterError(f'{name} must be positive and finite, got {value!r} m')
+            checked(name, value, 'm', low=0.0, open_low=True)
         self._needle, steering, _ = find_needle(needle)
         reach = self._needle.length - steering.free_length
         if depth > reach:

@@ -40,7 +40,6 @@ from typing import Any, NamedTuple
 
 from needle_controller.compiled import guide_plan, hypotheses
 from needle_controller.steering.law import (
-    checked_roll,
     checked_target,
     checked_tip,
     Forecast,
@@ -54,6 +53,7 @@ from needle_controller.steering.responses import SteeringModel
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import ComplexArray, FloatArray
 from needle_ros.errors import JobError, ParameterError, ShapeError
+from needle_ros.settings import checked
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -125,7 +125,7 @@ class MultiHypothesisLaw(SteeringLaw):
     def __init__(
         self, model: SteeringModel, target: ArrayLike, limits: SteeringLimits, roll: float = 0.0
     ) -> None:
-        roll, limit, turns = checked_roll(roll), limits.guide_limit, limits.turns
+        roll, limit, turns = checked('roll', roll), limits.guide_limit, limits.turns
         if limit == 0.0 and turns == 0:
             raise ParameterError('guide_limit and turns cannot both be 0: nothing would move')
         points, tips, count = len(model.responses.guide), model.steps + 1, len(model.lengths)
