@@ -21,6 +21,7 @@ from needle_identification.recordings.likeness import (
     likeness,
     most_alike,
     oblique,
+    tilted,
     velocity_of,
 )
 from needle_identification.recordings.merging import clock_offset
@@ -379,12 +380,8 @@ def _suggestion(
     words = [what]
     if loss := clock_offset(force.samples, motion.samples)[1]:
         words.append(loss)
-    across = {
-        one.axis: one.values
-        for one in motions
-        if one.vector == motion.vector and one.axis != motion.axis
-    }
-    words += oblique(motion.axis, motion.values, across)
+    words += oblique(motion.axis, motion.values, _across(motion, motions))
+    words += tilted(force.axis, force.values, _across(force, forces))
     options = []
     for option, one, types in (
         ('--wrench-topic', force, _FORCE),
@@ -400,10 +397,23 @@ def _suggestion(
     if axis != 'y':
         options += ['--force-axis', axis]
     usual = INSERTION if motion.topic.type_name == wire.JOINT_STATE else 'y'
-    if motion.axis != usual and components[motion.topic] > 1:
+    span = float(np.ptp(motion.values))
+    if motion.topic.type_name not in _VELOCITIES and span > reading.LONGEST_STROKE:
+        words.append(f'it moves over {span:.3g} m if it is in m: mm assumed')
+        options += ['--motion-axis', f'{motion.axis}[mm]']
+    elif motion.axis != usual and components[motion.topic] > 1:
         options += ['--motion-axis', motion.axis]
     command = shlex.join(['needle', 'identify', 'friction', str(path), *options])
     return words, command
+
+
+def _across(chosen: _Signal, signals: Sequence[_Signal]) -> dict[str, FloatArray]:
+    """Return the other components of the vector of a component."""
+    return {
+        one.axis: one.values
+        for one in signals
+        if one.vector == chosen.vector and one.axis != chosen.axis
+    }
 
 
 def _friction(force: _Signal, motion: _Signal) -> Likeness:

@@ -2,6 +2,7 @@
 """Similarity of a force and a motion to friction, and their signs."""
 
 from collections.abc import Mapping, Sequence
+from math import sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
@@ -82,14 +83,33 @@ def most_alike(found: Sequence[tuple[Likeness, float, object]]) -> int:
 
 def oblique(name: str, moved: FloatArray, others: Mapping[str, FloatArray]) -> list[str]:
     """Warn of other components by name that move in proportion to a component, (n,) each."""
-    about, lines = moved - moved.mean(), []
+    return [
+        f'{other} moves by {ratio:.2g} of {name}: the motion is oblique to the axis, '
+        'rotate it or choose the axis along the needle'
+        for other, ratio in _in_proportion(moved, others)
+    ]
+
+
+def tilted(name: str, force: FloatArray, others: Mapping[str, FloatArray]) -> list[str]:
+    """Warn of other components by name that are in proportion to a force, (n,) each."""
+    found = _in_proportion(force, others)
+    if not found:
+        return []
+    factor = sqrt(1.0 + sum(ratio**2 for _, ratio in found))
+    parts = ' and '.join(f'{other} is {ratio:.2g} of {name}' for other, ratio in found)
+    part = f'a sensor that is tilted measures along {name} only a part of the force'
+    return [f'{parts}: {part}, which is {factor:.3g} times as large; rotate its readings']
+
+
+def _in_proportion(
+    values: FloatArray, others: Mapping[str, FloatArray]
+) -> list[tuple[str, float]]:
+    """Return name and ratio of the components that are in proportion to a component."""
+    about, found = values - values.mean(), []
     power = about @ about
-    for other, values in others.items():
-        along = values - values.mean()
-        ratio = (about @ along) / power if power else 0.0
+    for other, component in others.items():
+        along = component - component.mean()
+        ratio = float(about @ along) / power if power else 0.0
         if abs(ratio) > _OBLIQUE and ratio**2 * power > _IN_PROPORTION * (along @ along):
-            lines.append(
-                f'{other} moves by {ratio:.2g} of {name}: the motion is oblique to the axis, '
-                'rotate it or choose the axis along the needle'
-            )
-    return lines
+            found.append((other, ratio))
+    return found

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
+from needle_dynamics.arrays import FloatArray
 from needle_identification.bags.bag import Bag, TABLES
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
@@ -15,10 +16,18 @@ from needle_identification.recordings import friction_table, samples, tables, TI
 from needle_identification.recordings.likeness import oblique
 from needle_identification.recordings.merging import merge, merged_recording
 from needle_identification.recordings.recording import IndentationRecording, Recording
+from needle_identification.recordings.units import BRACKETS, UNITS
 from needle_ros import wire
-from needle_ros.contract import BASE_WRENCH, END_EFFECTOR_POSE, JOINT_STATES, TIP_DEFLECTION
+from needle_ros.contract import (
+    BASE_WRENCH,
+    END_EFFECTOR_POSE,
+    INSERTION,
+    JOINT_STATES,
+    TIP_DEFLECTION,
+)
 from needle_ros.errors import MessageError, ParameterError
 from needle_ros.quantities import AXES, signed, signed_axis
+import numpy as np
 
 _FIRST: Final = 50  # number of messages that are read for joint names
 
@@ -38,6 +47,8 @@ _WRENCH: Final = Wanted('wrench_topic', (wire.WRENCH,), (BASE_WRENCH.name,))
 TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (TIP_DEFLECTION.name,))
 _POSES: Final = (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE)
 _USUAL: Final = (END_EFFECTOR_POSE.name, JOINT_STATES.name)
+#: Spans of positions of an insertion and of presses above which they are rarely in m.
+LONGEST_STROKE, _DEEPEST_PRESS = 2.0, 0.5
 _FRICTION_MOTION: Final = Wanted('motion_topic', MOTIONS, _USUAL[::-1])
 _INDENTATION_MOTION: Final = Wanted('motion_topic', _POSES, _USUAL)
 
@@ -67,10 +78,11 @@ def read_friction_recording(
         Topic of type JointState, PoseStamped, PointStamped, TwistStamped or Odometry; default the
         only such topic, else the topic with the last name joint_states or end_effector_pose.
     force_axis : str
-        Component of the force into the tissue: x, y or z, with ``-`` for the opposite sign.
+        Component of the force into the tissue: x, y or z, with ``-`` for the opposite sign, and
+        with a unit in brackets if it is not N: ``-z[mN]``.
     motion_axis : str, optional
         Component of the motion into the tissue, likewise; default y. For a JointState the joint;
-        default insertion, or the only joint.
+        default insertion, or the only joint. With ``[mm]``, the velocity is in mm/s.
     time : str
         Stamps to use, one of `TIMES`.
     columns : mapping of str to str, optional
@@ -111,12 +123,14 @@ def read_friction_recording(
         return friction_table.friction_recording(tables.read_table(Path(path)), columns or {})
     if columns:
         raise RecordingError(f'{path} is a bag: --columns is for tables ({", ".join(TABLES)})')
-    sign, axis = signed_axis(force_axis, 'force axis')
+    given, size = _without_unit(force_axis, 'force')
+    sign, axis = signed_axis(given, 'force axis')
     bag = Bag(path)
     topics = bag.topics()
     wrench = chosen_topic(bag, topics, _WRENCH, wrench_topic)
     motion = chosen_topic(bag, topics, _FRICTION_MOTION, motion_topic)
-    source, direction = _motion_source(bag, motion, motion_axis)
+    along_axis, length = _without_unit(motion_axis, 'depth')
+    source, direction, name = _motion_source(bag, motion, along_axis)
     force_source = samples.source_of(wrench.type_name, [axis])
     gathered, configuration = read_samples(bag, {wrench: force_source, motion: source}, time)
     force = gathered[wrench].samples(bag)
@@ -130,8 +144,12 @@ def read_friction_recording(
         moved = samples.position_and_velocity(moved, bag)
     else:
         bag.losses.append(f'{motion.name} has no velocity')
-    moved = moved._replace(values=direction * moved.values)
-    return merged_recording(bag, force._replace(values=sign * force.values), moved, configuration)
+    moved = moved._replace(values=direction * length * moved.values)
+    if length == 1.0:
+        bag.losses += _too_long(motion, moved.values[:, 0], LONGEST_STROKE, '--motion-axis', name)
+    return merged_recording(
+        bag, force._replace(values=sign * size * force.values), moved, configuration
+    )
 
 
 def read_indentation_recording(
@@ -140,6 +158,7 @@ def read_indentation_recording(
     wrench_topic: str | None = None,
     motion_topic: str | None = None,
     axes: tuple[str, str] = ('x', 'z'),
+    force_axes: tuple[str, str] | None = None,
     time: str = 'header',
 ) -> IndentationRecording:
     """
@@ -154,7 +173,11 @@ def read_indentation_recording(
         default the only such topic, else the topic with the last name end_effector_pose or
         joint_states.
     axes : (str, str)
-        Axes of the plane: x, y or z; ``-`` reverses the sign of both force and position.
+        Axes of the plane: x, y or z; ``-`` reverses the sign of both force and position. With a
+        unit in brackets, ``x[mm]``, it is the unit of the position.
+    force_axes : (str, str), optional
+        Axes of the force along these axes, with ``-`` if only the force is reversed, and with a
+        unit in brackets if it is not N; default the same axes.
 
     Returns
     -------
@@ -162,45 +185,82 @@ def read_indentation_recording(
         Force and position; ``losses`` lists discarded and repaired data.
 
     """
-    signs, plane = zip(*(signed_axis(axis, 'axis of the plane') for axis in axes), strict=True)
-    if len(set(plane)) != 2:
-        raise ParameterError(f'axes must be two different axes of x, y, z, got {axes!r}')
+    signs, plane, sizes = _plane('axes', axes, 'depth')
+    if force_axes is None:
+        force_signs, pressed = signs, plane
+    else:
+        scales, pressed, units = _plane('force_axes', force_axes, 'force')
+        force_signs = scales * units
     across = next(axis for axis in AXES if axis not in plane)
     bag = Bag(path)
     topics = bag.topics()
     wrench = chosen_topic(bag, topics, _WRENCH, wrench_topic)
     motion = chosen_topic(bag, topics, _INDENTATION_MOTION, motion_topic)
     sources = {
-        wrench: samples.source_of(wrench.type_name, plane),
+        wrench: samples.source_of(wrench.type_name, pressed),
         motion: samples.source_of(motion.type_name, (*plane, across)),
     }
     gathered, configuration = read_samples(bag, sources, time)
     times, forces, positions, clock_offset = merge(
         bag, gathered[wrench].samples(bag), gathered[motion].samples(bag)
     )
+    length = float(sizes.max())
+    if length == 1.0:
+        for axis, position in zip(plane, positions.T, strict=False):
+            bag.losses += _too_long(motion, position, _DEEPEST_PRESS, '--axes', axis)
     return IndentationRecording(
         name=str(path),
         time=times,
-        position=positions[:, :2] * signs,
-        off_plane=positions[:, 2],
-        force=forces * signs,
+        position=positions[:, :2] * signs * sizes,
+        off_plane=positions[:, 2] * length,
+        force=forces * force_signs,
         losses=tuple(bag.losses),
         configuration=configuration,
         clock_offset=clock_offset,
     )
 
 
+def _without_unit(axis: Any, role: str) -> tuple[Any, float]:
+    """Split an axis, such as ``slide[mm]``, into its name and the size of its unit."""
+    found = BRACKETS.match(axis or '')
+    unit = found[2].strip() if found else ''
+    return (found[1], UNITS[role][unit]) if found and unit in UNITS[role] else (axis, 1.0)
+
+
+def _plane(
+    name: str, axes: tuple[str, str], role: str
+) -> tuple[FloatArray, tuple[str, ...], FloatArray]:
+    """Return the signs, names and sizes of the units of two different axes."""
+    given, sizes = zip(*(_without_unit(axis, role) for axis in axes), strict=True)
+    signs, plane = zip(*(signed_axis(axis, f'each of {name}') for axis in given), strict=True)
+    if len(set(plane)) != 2:
+        raise ParameterError(f'{name} must be two different axes of x, y, z, got {axes!r}')
+    return np.array(signs), plane, np.array(sizes)
+
+
+def _too_long(
+    topic: BagTopic, positions: FloatArray, longest: float, option: str, axis: str
+) -> list[str]:
+    """Warn of positions whose span is rarely one in m."""
+    known = positions[np.isfinite(positions)]
+    span = float(np.ptp(known)) if len(known) else 0.0
+    if span <= longest:
+        return []
+    return [f'{topic.name} moves over {span:.3g} m along {axis}: perhaps {option} {axis}[mm]']
+
+
 def _motion_source(
     bag: Bag, topic: BagTopic, axis: str | None
-) -> tuple[samples.SignalSource, float]:
-    """Return the source of a motion along an axis or of a joint, and its sign."""
+) -> tuple[samples.SignalSource, float, str]:
+    """Return the source of a motion along an axis or of a joint, its sign, and its name."""
     if topic.type_name == wire.JOINT_STATE:
         sign, joint = signed(axis or '')
-        return samples.source_of(topic.type_name, 'y', joint or _only_joint(bag, topic)), sign
+        name = joint or _only_joint(bag, topic) or INSERTION
+        return samples.source_of(topic.type_name, 'y', name), sign, axis or name
     sign, name = signed_axis('y' if axis is None else axis, 'motion axis')
     if topic.type_name == wire.ODOMETRY:
-        return samples.source_of(topic.type_name, [name]), sign
-    return samples.ObliqueVector(name), sign
+        return samples.source_of(topic.type_name, [name]), sign, axis or name
+    return samples.ObliqueVector(name), sign, axis or name
 
 
 def _only_joint(bag: Bag, topic: BagTopic) -> str | None:

@@ -119,6 +119,8 @@ def find_presses(
 def _fraction(change: FloatArray, displacement: FloatArray) -> float:
     """Return the factor of changes (m, 2) that follow the displacements; 0 if insignificant."""
     power = float((displacement**2).sum())
+    if power == 0.0:
+        return 0.0
     factor = float((change * displacement).sum()) / power
     left = change - factor * displacement
     error = sqrt(float((left**2).sum()) / max(1, 2 * len(change) - 1) / power)

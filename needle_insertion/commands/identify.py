@@ -26,7 +26,7 @@ from needle_ros.errors import NeedleError, ParameterError, shown
 from needle_ros.quantities import quantities
 
 #: Options whose value may begin with a minus sign.
-SIGNED: Final = ('--force-axis', '--motion-axis', '--axes', '--truth')
+SIGNED: Final = ('--force-axis', '--motion-axis', '--axes', '--force-axes', '--truth')
 
 KINDS: Final = ('friction', 'stiffness', 'steering', 'sensor')  #: Kinds of identification.
 
@@ -57,13 +57,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default='y',
         metavar='AXIS',
         help='axis of the wrench, x, y or z, that points into the tissue for the force on the '
-        'needle; -x, -y or -z inverts the sign (default y)',
+        'needle; -x, -y or -z inverts the sign, z[mN] has a unit (default y)',
     )
     reading.add_argument(
         '--motion-axis',
         metavar='AXIS',
         help='axis of the motion, likewise; for a JointState the name of the joint, or -name '
-        '(default y; the joint insertion or the only joint)',
+        'or name[mm] (default y; the joint insertion or the only joint)',
     )
     reading.add_argument(
         '--columns',
@@ -100,7 +100,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=common.words_of,
         default=['x', 'z'],
         metavar='X,Z',
-        help='axes across the needle and along its deflection; -x inverts an axis (default x,z)',
+        help='axes across the needle and along its deflection; -x inverts an axis, x[mm] has a '
+        'unit (default x,z)',
+    )
+    reading.add_argument(
+        '--force-axes',
+        type=common.words_of,
+        metavar='X,Z',
+        help='axes of the force along --axes, likewise, if they or their signs differ',
     )
     level = 'force level of the stiffness to report (default: the largest)'
     common.add_quantity(fitting, '--level', 'N', level)
@@ -179,14 +186,17 @@ def _run_friction(options: argparse.Namespace) -> int:
 
 def _run_stiffness(options: argparse.Namespace) -> int:
     settings = _settings(identification.StiffnessSettings, options)
-    if len(options.axes) != 2:
-        raise ParameterError(f'--axes must name two axes, got {",".join(options.axes)}')
+    axes = {'axes': options.axes, 'force_axes': options.force_axes}
+    for name, given in axes.items():
+        if given is not None and len(given) != 2:
+            option = f'--{name.replace("_", "-")}'
+            raise ParameterError(f'{option} must name two axes, got {",".join(given)}')
     summarize = partial(
         identification.summarize_stiffness,
         force=options.level,
         level_tolerance=settings.level_tolerance,
     )
-    axes = {'axes': tuple(options.axes)}
+    axes = {name: given and tuple(given) for name, given in axes.items()}
     return _identify(options, 'stiffness', (settings,), axes, summarize)
 
 

@@ -78,7 +78,7 @@ def test_membranes_start_depth_and_seed_take_effect(capsys: pytest.CaptureFixtur
         ),
         (['--model', 'modes', '--to', '0.1'], '--to is an option of --model steering, not'),
         (['--model', 'steering', '--to', '0.3'], 'the needle reached 160 mm, where its hub stops'),
-        (['--model', 'steering', '--speed', '0'], '--speed must be finite and >= 1e-06 m/s'),
+        (['--model', 'steering', '--speed', '0'], '--speed must be finite, >= 1e-06 m/s'),
         (['--model', 'steering', '--depth', '0.2'], '--to must be beyond --depth'),
         (['--model', 'steering', '--interval', '1e-9'], 'with at most 1000000 samples'),
         (['--model', 'steering', '--seed', '-1'], 'seed must be an integer >= 0, got -1'),

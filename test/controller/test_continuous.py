@@ -222,7 +222,7 @@ def test_sampled_law_converges_to_the_continuous_law(kind: str) -> None:
         ({'kv': [1.0, 0.0]}, ParameterError, 'kv must be positive definite'),
         ({'kp': [[1.0, 5.0], [5.0, 1.0]]}, ParameterError, 'kp must be positive definite'),
         ({'actuation': 'magnetic'}, ParameterError, 'one of physical, modal'),
-        ({'breakaway_speed': -1.0}, ParameterError, 'breakaway_speed must be finite and >= 0'),
+        ({'breakaway_speed': -1.0}, ParameterError, 'breakaway_speed must be finite, >= 0'),
     ],
 )
 def test_invalid_gains_are_rejected(

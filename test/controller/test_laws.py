@@ -124,7 +124,7 @@ def test_response_is_continuous_at_zero_friction() -> None:
 @pytest.mark.parametrize(
     ('changes', 'words'),
     [
-        ({'inertia': 0.0}, 'inertia must be finite and > 0'),
+        ({'inertia': 0.0}, 'inertia must be finite, > 0'),
         ({'inertia': 1.0, 'viscous': -1.0}, 'viscous must be finite, >= 0 N s/m'),
     ],
 )

@@ -245,7 +245,7 @@ def test_leaving_the_depth_range_raises_the_error_of_the_integrator() -> None:
     ('options', 'complaint'),
     [
         ({'tolerance': 1e-3, 'step': 1e-5}, 'tolerance and step exclude each other'),
-        ({'tolerance': 0.0}, 'tolerance must be positive and finite'),
+        ({'tolerance': 0.0}, 'tolerance must be finite, > 0'),
         ({'graded': True}, 'graded and order require a step'),
         ({'order': 4}, 'graded and order require a step'),
         ({'step': 1e-5, 'order': 3}, 'order must be one of 2, 4, 6, 8, got 3'),

@@ -954,7 +954,7 @@ def test_state_is_a_copy() -> None:
 @pytest.mark.parametrize('step', [0.0, -1e-5, np.nan, np.inf])
 def test_step_must_be_positive_and_finite(step: float) -> None:
     """The message contains name and value."""
-    with pytest.raises(ParameterError, match='step must be finite and >= 1e-09 s, got'):
+    with pytest.raises(ParameterError, match='step must be finite, >= 1e-09 s, got'):
         needle(step=step)
 
 

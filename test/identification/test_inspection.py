@@ -3,16 +3,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 import json
 from pathlib import Path
 import shlex
 from typing import Any
 
-from needle_identification import BagWriter, inspect_recording, RecordingError
+from needle_identification import (
+    BagWriter,
+    inspect_recording,
+    read_friction_recording,
+    RecordingError,
+)
 from needle_identification.recordings.tables import column_roles
 from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
 from needle_insertion.cli import main
 import numpy as np
+from numpy.testing import assert_allclose
 import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import get_typestore, Stores
@@ -157,24 +164,60 @@ def test_an_oblique_motion_of_a_bag_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The needle along x and -z; the third component is not known."""
-    made, kinds, path = strokes(seed=1, push=0.0), STORE.types, tmp_path / 'bag'
-    still = kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
-    with BagWriter(path) as bag:
-        for topic, kind in (('/ft', WRENCH), ('/pose', POSE)):
-            bag.add_topic(topic, kind)
-        for t, depth, force in zip(made.time.tolist(), made.depth, made.force, strict=True):
-            stamp = EPOCH + round(1e9 * t)
-            bag.write('/ft', wrench(stamp, force), stamp)
-            point = kinds['geometry_msgs/msg/Point'](0.6 * depth, 0.0, -0.8 * depth)
-            pose = kinds['geometry_msgs/msg/Pose'](point, still)
-            message = kinds[POSE](header(stamp), pose)
-            bag.write('/pose', bytes(STORE.serialize_cdr(message, POSE)), stamp)
-    found = inspect_recording(path)
+    found = inspect_recording(posed(tmp_path / 'bag', motion=(0.6, 0.0, -0.8)))
     assert found.command.endswith('--force-axis -y --motion-axis z')
     said = 'x moves by -0.75 of z: the motion is oblique to the axis'
     assert any(said in one for one in found.words)
     assert run(found.command) == 0
     assert said in capsys.readouterr().err
+
+
+def test_a_motion_in_mm_of_a_bag_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The suggested command has the unit; the recording is that of the motion in m."""
+    found = inspect_recording(posed(tmp_path / 'bag', motion=(0.0, 1e3, 0.0)))
+    assert found.command.endswith("--motion-axis 'y[mm]'")
+    assert run(found.command) == 0
+    assert 'perhaps' not in capsys.readouterr().err
+    in_mm = read_friction_recording(tmp_path / 'bag', motion_axis='y[mm]', force_axis='y[mN]')
+    in_m = read_friction_recording(posed(tmp_path / 'other'))
+    assert_allclose(in_mm.depth, in_m.depth, rtol=1e-12)
+    assert_allclose(in_mm.force, 1e-3 * in_m.force, rtol=1e-12)
+    assert main(['identify', 'friction', str(tmp_path / 'bag')]) == 0
+    assert 'm along y: perhaps --motion-axis y[mm]' in capsys.readouterr().err
+
+
+def test_a_tilted_force_sensor_is_named(tmp_path: Path) -> None:
+    found = inspect_recording(posed(tmp_path / 'bag', force=(0.0, 0.8, 0.6)))
+    said = 'z is 0.75 of y: a sensor that is tilted measures along y only a part of the force'
+    assert any(said in one and 'which is 1.25 times as large' in one for one in found.words)
+    straight = inspect_recording(posed(tmp_path / 'other'))
+    assert not any('tilted' in one for one in straight.words)
+
+
+def posed(
+    path: Path, motion: Sequence[float] = (0.0, 1.0, 0.0), force: Sequence[float] = (0.0, 1.0, 0.0)
+) -> Path:
+    """Write strokes as force and pose along given directions."""
+    made, kinds = strokes(seed=1, push=0.0), STORE.types
+    still = kinds['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+    with BagWriter(path) as bag:
+        for topic, kind in (('/ft', WRENCH), ('/pose', POSE)):
+            bag.add_topic(topic, kind)
+        for t, depth, size in zip(made.time.tolist(), made.depth, made.force, strict=True):
+            stamp = EPOCH + round(1e9 * t)
+            vectors = (
+                kinds['geometry_msgs/msg/Vector3'](*parts)
+                for parts in ([part * size for part in force], (0.0, 0.0, 0.0))
+            )
+            wrenches = kinds[WRENCH](header(stamp), kinds['geometry_msgs/msg/Wrench'](*vectors))
+            bag.write('/ft', bytes(STORE.serialize_cdr(wrenches, WRENCH)), stamp)
+            point = kinds['geometry_msgs/msg/Point'](*[part * depth for part in motion])
+            pose = kinds['geometry_msgs/msg/Pose'](point, still)
+            message = kinds[POSE](header(stamp), pose)
+            bag.write('/pose', bytes(STORE.serialize_cdr(message, POSE)), stamp)
+    return path
 
 
 def run(command: str) -> int:

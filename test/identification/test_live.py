@@ -230,7 +230,7 @@ def test_missing_topic_is_named() -> None:
 
 @pytest.mark.parametrize('window', [0.0, -1.0, nan, inf])
 def test_invalid_window_is_rejected(window: float) -> None:
-    with pytest.raises(ParameterError, match='window must be finite and > 0'):
+    with pytest.raises(ParameterError, match='window must be finite, > 0 s'):
         LiveRecording(window)
 
 

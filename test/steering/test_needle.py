@@ -373,9 +373,9 @@ def test_path_noise_spreads_the_tips() -> None:
     [
         ({'depth': -1e-3}, ParameterError, r'depth must be in \[0, 0\.58\] m'),
         ({'depth': 0.59}, ParameterError, r'minus its free length, got 0\.59 m'),
-        ({'depth': nan}, ParameterError, 'depth must be a finite number, got nan'),
-        ({'depth': True}, ParameterError, 'depth must be a finite number, got True'),
-        ({'roll': inf}, ParameterError, 'roll must be a finite number, got inf'),
+        ({'depth': nan}, ParameterError, 'depth must be finite, got nan'),
+        ({'depth': True}, ParameterError, 'depth must be a number, got True'),
+        ({'roll': inf}, ParameterError, 'roll must be finite, got inf'),
         ({'guide': (0.0, nan)}, ParameterError, 'guide must be finite'),
         ({'tilt': (0.0,)}, ShapeError, r'tilt must have shape \(2,\), got \(1,\)'),
         ({'tissue': (0.0, 0.0)}, ShapeError, r'tissue must have shape \(3,\)'),
