@@ -433,7 +433,7 @@ def test_unknown_options_of_reset_are_rejected(made: Any, option: str, valid: st
     ('options', 'complaint'),
     [
         ({'needle': 'bone'}, 'needle must be one of'),
-        ({'depth': 0.0}, 'depth must be positive'),
+        ({'depth': 0.0}, 'depth must be finite, > 0 m'),
         ({'depth': 1.0}, 'depth must be <='),
     ],
 )
