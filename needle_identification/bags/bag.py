@@ -2,9 +2,11 @@
 """Read topics, messages and columns of bags, also of incomplete or damaged bags."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from heapq import heappop, heappush
+from itertools import pairwise
 from pathlib import Path
 import re
 import sqlite3
@@ -12,7 +14,12 @@ from typing import Any, Final, NamedTuple
 
 from needle_dynamics.display import Displayed
 from needle_identification.bags.compression import Budget, COMPRESSED
-from needle_identification.bags.mcap_file import DAMAGED_MCAP, indexed_topics, mcap_batches
+from needle_identification.bags.mcap_file import (
+    DAMAGED_MCAP,
+    indexed_span,
+    indexed_topics,
+    mcap_batches,
+)
 from needle_identification.bags.sqlite_file import sqlite_batches
 from needle_identification.bags.topics import BagTopic, MessageBatch, Tally
 from needle_identification.errors import RecordingError
@@ -35,6 +42,8 @@ _VALID: Final = (
     'valid: a rosbag2 folder, an .mcap or a .db3 file, or a .bag file of ROS 1; for friction, '
     f'steering and sensor also a table ({", ".join(TABLES)})'
 )
+
+_PAUSE: Final = NANOSECONDS  # between parts of one recording, this long or longer [ns]
 
 _WINDOW: Final = 2**22  # size of the buffer for sorting messages by receive time [bytes]
 
@@ -60,9 +69,8 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
         if not form_of(path):
             raise RecordingError(f'{path} is not a recording; {_VALID}')
         return [path], []
-    # Sort part_10 after part_9.
     inside = path.iterdir() if path.is_dir() else ()
-    found = sorted(filter(Path.is_file, inside), key=lambda file: [len(file.name), file.name])
+    found = _in_order(filter(Path.is_file, inside))
     by_form = {form: [file for file in found if form_of(file) == form] for form in _FORMS}
     chosen = next(filter(None, by_form.values()), [])
     if not chosen:
@@ -78,10 +86,10 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
         # Missing, or of an unknown structure.
         pass
     if names is None:
-        # The parts of one recording differ only in a number at the end of the name.
-        if len({re.sub(r'_\d+$', '', _uncompressed(file).stem) for file in chosen}) > 1:
+        by_time = not (path / METADATA).exists()
+        if len(recordings_among(chosen, by_time=by_time)) > 1:
             raise RecordingError(
-                f'{path} holds several recordings; name them, such as {chosen[0]}; {losses[0]}'
+                f'{path} holds several recordings; name them, such as {chosen[0]}'
             )
         return chosen, losses
     there = {file.name for file in chosen}
@@ -97,6 +105,47 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
     return [path / name for name in names if name in there], losses
 
 
+def recordings_among(files: Iterable[Path], *, by_time: bool = True) -> list[list[Path]]:
+    """Group data files of bags by recording: parts of a split one continue in name and time."""
+    # The names of parts differ only in a number at the end.
+    alike: dict[tuple[str, str], list[Path]] = {}
+    for file in _in_order(files):
+        stem = re.sub(r'_\d+$', '', _uncompressed(file).stem)
+        alike.setdefault((stem, form_of(file)), []).append(file)
+    groups: list[list[Path]] = []
+    for parts in alike.values():
+        joined = len(parts) == 1 or not by_time or _continue(parts)
+        groups += [parts] if joined else [[part] for part in parts]
+    return groups
+
+
+def _in_order(files: Iterable[Path]) -> list[Path]:
+    # Part_10 is after part_9.
+    return sorted(files, key=lambda file: [len(file.name), file.name])
+
+
+def _continue(parts: Sequence[Path]) -> bool:
+    """Whether each file begins when the one before ends, as far as their times are readable."""
+    return all(
+        not before or not after or abs(after[0] - before[1]) < _PAUSE
+        for before, after in pairwise(map(_span, parts))
+    )
+
+
+def _span(file: Path) -> tuple[int, int] | None:
+    """Return the first and the last receive time [ns] of a file, None without messages."""
+    if file.suffix == '.bag':
+        return _ros1_span(file)
+    if file.suffix == '.mcap' and (span := indexed_span(file)):
+        return span
+    times: list[int] = []
+    tally = Tally({}, lambda _topic: True, [], Budget(file))
+    with suppress(RecordingError, OSError, sqlite3.Error, *DAMAGED_MCAP):
+        for batch in _BATCHES[form_of(file)](file, tally):
+            times += [int(batch.received.min()), int(batch.received.max())]
+    return (min(times), max(times)) if times else None
+
+
 def _metadata(folder: Path) -> tuple[list[str], str]:
     """Return the files listed in the metadata of a bag, and its lost messages."""
     with (folder / METADATA).open(encoding='utf-8') as stream:
@@ -108,6 +157,15 @@ def _metadata(folder: Path) -> tuple[list[str], str]:
     own = information.get('custom_data') or {}
     lost = printable(str(own.get(LOST, ''))) if isinstance(own, dict) else ''
     return list(dict.fromkeys(Path(str(name)).name for name in paths)), lost
+
+
+def _ros1_span(file: Path) -> tuple[int, int] | None:
+    # Lazy import, as for the messages.
+    from needle_identification.bags.ros1_file import ros1_span
+
+    with suppress(RecordingError, OSError):
+        return ros1_span(file)
+    return None
 
 
 def _ros1_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:

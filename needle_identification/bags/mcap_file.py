@@ -98,6 +98,20 @@ def indexed_topics(file: Path) -> set[BagTopic] | None:
         return None
 
 
+def indexed_span(file: Path) -> tuple[int, int] | None:
+    """Return the first and last receive time [ns] by the index; None without a valid index."""
+    summary = _summary(file)
+    with suppress(*DAMAGED_MCAP):
+        for begin, end in _records(summary):
+            for first, after in zip(begin.tolist(), end.tolist(), strict=True):
+                if summary[first - _HEAD.size] == Opcode.STATISTICS:
+                    stream = ReadDataStream(BytesIO(summary[first - _HEAD.size : after]))
+                    found = Statistics.read(stream)
+                    if found.message_count:
+                        return found.message_start_time, found.message_end_time
+    return None
+
+
 def _summary(file: Path) -> bytes:
     """Return the index at the end of a file, b'' without a valid one."""
     try:

@@ -3,6 +3,7 @@
 
 from bz2 import BZ2Decompressor
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from heapq import merge
 from itertools import islice
@@ -26,6 +27,7 @@ from rosbags.typesys import get_typestore, Stores
 
 _ENTRY: Final = 12  # size of an entry of the index [bytes]
 _RECORD: Final = 128  # number of bytes in a chunk that count as a record
+_MAGIC: Final = b'#ROSBAG V2.0'  # first bytes of a file
 _DAMAGED: Final = (ReaderError, SerdeError, EOFError, *DAMAGED)  # for damaged bytes
 
 #: Decompressors of the library, and replacements with a size limit.
@@ -51,14 +53,32 @@ class _Reader(Reader):
 
 def ros1_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     """Read a ``.bag`` file; yield its messages, converted to ROS 2."""
+    has_index = False
     try:
         with _Reader(file, tally.budget) as reader:
+            has_index = True
             for at, chunk in reader.chunks.items():
                 bounded = partial(_unfolded, chunk.decompressor, tally.budget)
                 reader.chunks[at] = chunk._replace(decompressor=bounded)
             yield from _batches(reader, tally)
     except _DAMAGED as error:
-        tally.faults.append(f'is damaged: {error}')
+        remedy = '' if has_index else _remedy(file, error)
+        tally.faults.append(f'is damaged: {error}{remedy}')
+
+
+def ros1_span(file: Path) -> tuple[int, int] | None:
+    """Return the first and last receive time [ns] by the index; None without a valid index."""
+    with suppress(*_DAMAGED), _Reader(file, Budget(file)) as reader:
+        if reader.message_count:
+            return reader.start_time, reader.end_time
+    return None
+
+
+def _remedy(file: Path, error: Exception) -> str:
+    """Return how to read a file without its index, '' for one that is not of ROS 1."""
+    with file.open('rb') as stream:
+        is_ros1 = stream.read(len(_MAGIC)) == _MAGIC
+    return f' (try rosbag reindex {file.name})' if is_ros1 and 'support' not in str(error) else ''
 
 
 def _batches(reader: Reader, tally: Tally) -> Iterator[MessageBatch]:

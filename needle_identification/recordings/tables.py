@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 import zlib
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
-from needle_identification.bags.bag import form_of, MATLAB, METADATA, TABLES
+from needle_identification.bags.bag import MATLAB, TABLES
 from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.samples import are_gaps, Series
@@ -99,24 +99,6 @@ def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
 
 def is_table(path: Path | str) -> bool:
     return Path(path).suffix.lower() in TABLES
-
-
-def recordings_in(path: Path) -> list[Path]:
-    """Return the tables and bags in a folder that is no bag itself, in any other case the path."""
-    inside = [] if _has_bag(path) else _inside(path)
-    return [one for one in inside if is_table(one) or _has_bag(one)] or [path]
-
-
-def _has_bag(folder: Path) -> bool:
-    """Whether a folder has files of a bag, also of one that was not closed."""
-    return any(form_of(one) or one.name == METADATA for one in _inside(folder) if one.is_file())
-
-
-def _inside(folder: Path) -> list[Path]:
-    # A folder that cannot be read is reported when it is read as a recording.
-    with suppress(OSError):
-        return sorted(folder.iterdir()) if folder.is_dir() else []
-    return []
 
 
 def read_table(path: Path) -> Table:

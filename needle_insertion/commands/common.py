@@ -35,7 +35,7 @@ class _Recordings(Action):
     def __call__(
         self, _parser: ArgumentParser, options: Namespace, values: Any, _option: str | None = None
     ) -> None:
-        from needle_identification.recordings.tables import recordings_in
+        from needle_identification.recordings.folders import recordings_in
 
         setattr(options, self.dest, [one for path in values for one in recordings_in(path)])
 

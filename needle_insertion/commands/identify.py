@@ -13,7 +13,8 @@ import sys
 from typing import Any, Final
 
 import needle_identification as identification
-from needle_identification.recordings.tables import column_roles, recordings_in, ROLES
+from needle_identification.recordings.folders import recordings_in
+from needle_identification.recordings.tables import column_roles, ROLES
 from needle_identification.result import constants_of, limited
 from needle_identification.steering.reading import STEERING_ROLES
 from needle_insertion.commands import common

@@ -97,6 +97,16 @@ def test_terms_are_a_list_or_repeated(capsys: pytest.CaptureFixture[str]) -> Non
     assert one == two
 
 
+def test_files_of_several_recordings_in_a_folder_are_all_used(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for name, bag in zip(('gel', 'liver'), BAGS, strict=False):
+        shutil.copy(next(Path(bag).glob('*.mcap')), tmp_path / f'{name}.mcap')
+    found = as_json(capsys, 'friction', str(tmp_path))
+    assert found == as_json(capsys, 'friction', *map(str, sorted(tmp_path.iterdir())))
+    assert len(found['recordings']) == 2
+
+
 @pytest.mark.parametrize(
     ('words', 'complaint'),
     [

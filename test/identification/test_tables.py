@@ -18,12 +18,7 @@ from needle_identification import (
     RecordingError,
 )
 from needle_identification.recordings import samples, tables
-from needle_identification.recordings.tables import (
-    column_roles,
-    guessed,
-    read_table,
-    recordings_in,
-)
+from needle_identification.recordings.tables import column_roles, guessed, read_table
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -337,24 +332,6 @@ def test_usual_names_are_found_with_any_case_and_unit(tmp_path: Path) -> None:
     }
     assert tables.is_table('A.CSV')
     assert not tables.is_table('a.mcap')
-
-
-def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
-    """Tables, and bags whether they were closed or not; a bag stands for itself."""
-    for name in (
-        'b.csv',
-        'a.MAT',
-        'notes.md',
-        'one/metadata.yaml',
-        'two/two_0.mcap',
-        'three/x.md',
-    ):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).touch()
-    found = [tmp_path / name for name in ('a.MAT', 'b.csv', 'one', 'two')]
-    assert recordings_in(tmp_path) == found
-    for other in (tmp_path / 'two', tmp_path / 'three', tmp_path / 'b.csv', tmp_path / 'none'):
-        assert recordings_in(other) == [other]
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
