@@ -85,7 +85,7 @@ class Table(NamedTuple):
 
 def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
     """Parse ``role=column,...`` of a command line; raise a RecordingError if invalid."""
-    found = {}
+    found: dict[str, str] = {}
     for word in text.split(','):
         role, sign, spec = (part.strip() for part in word.partition('='))
         if not (sign and role in roles and spec):
@@ -93,6 +93,8 @@ def column_roles(text: str, roles: Sequence[str] = ROLES) -> dict[str, str]:
                 f'--columns takes ROLE=[-]NAME[*FACTOR][UNIT],... with the roles '
                 f'{", ".join(roles)}, got {word!r}'
             )
+        if role in found:
+            raise RecordingError(f'--columns names {role} twice: {found[role]} and {spec}')
         found[role] = spec
     return found
 
@@ -229,15 +231,19 @@ def _column(table: Table, role: str, name: str) -> tuple[str, FloatArray]:
 
 
 def _factor(table: Table, role: str, spec: str, factor: str) -> float:
-    if factor in table.scalars:
-        return table.scalars[factor]
-    with suppress(ValueError):
-        return float(factor)
-    has = ', '.join(table.scalars) or 'no single numbers'
-    raise RecordingError(
-        f'--columns {role}={spec}: the factor must be a number or the name of one, got '
-        f'{factor!r}; {table.path} has {has}'
-    )
+    try:
+        value = table.scalars[factor] if factor in table.scalars else float(factor)
+    except ValueError:
+        has = ', '.join(table.scalars) or 'no single numbers'
+        raise RecordingError(
+            f'--columns {role}={spec}: the factor must be a number or the name of one, got '
+            f'{factor!r}; {table.path} has {has}'
+        ) from None
+    if not value or not np.isfinite(value):
+        raise RecordingError(
+            f'--columns {role}={spec}: the factor must be finite and not zero, got {value:g}'
+        )
+    return value
 
 
 def sorted_rows(

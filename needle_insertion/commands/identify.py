@@ -176,6 +176,13 @@ def _settings(kind: Callable[..., Any], options: argparse.Namespace) -> Any:
 
 def _run_friction(options: argparse.Namespace) -> int:
     settings = _settings(identification.FrictionSettings, options)
+    if (
+        settings.decay_time != identification.FrictionSettings().decay_time
+        and 'decay' not in settings.terms
+    ):
+        raise ParameterError(
+            f'--decay-time is for the term decay, got the terms {", ".join(settings.terms)}'
+        )
     fit = (settings, len(options.recordings))
     axes = {
         'force_axis': options.force_axis,

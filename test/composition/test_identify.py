@@ -115,6 +115,7 @@ def test_files_of_several_recordings_in_a_folder_are_all_used(
         (['--force-axis', 'w'], "'w'"),
         (['--wrench-topic', '/force'], '/base_wrench'),
         (['--motion-axis', '-slide'], 'slide'),
+        (['--decay-time', '3s'], '--decay-time is for the term decay, got the terms coulomb, v'),
     ],
 )
 def test_invalid_options_are_reported_in_one_line(

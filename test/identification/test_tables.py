@@ -280,6 +280,10 @@ def test_other_orders_of_rows_are_no_restart(tmp_path: Path, run: Any) -> None:
         ('t,q,F\n1,2,3\n2,3,4\n', {'time': 's'}, "no column 's' for time; it has t, q, F"),
         ('t,q,F\n1,2,3\n2,3,4\n', {'force': 'F[kg]'}, "must be one of N, mN, .*, got 'kg'"),
         ('t,q,F\n1,2,3\n2,3,4\n', {'force': 'F*k'}, 'a number or the name of one'),
+        *(
+            ('t,q,F\n1,2,3\n2,3,4\n', {'force': f'F*{word}'}, 'must be finite and not zero')
+            for word in ('nan', 'inf', '0')
+        ),
         ('t,q,F\n1,2,3\n1,3,4\n', {}, 'all rows have the same time'),
         ('t,q,F\n1,2,3\nnan,3,4\n', {}, '1 usable rows'),
         ('t,q,F\n1,2,3\n1e30,3,4\n', {}, 'is its unit right'),
@@ -300,6 +304,11 @@ def test_invalid_roles_are_rejected(words: str) -> None:
         'time': 'sec:nsec',
         'force': '-F*2[mN]',
     }
+
+
+def test_a_repeated_role_is_rejected() -> None:
+    with pytest.raises(RecordingError, match='--columns names time twice: t and Zeit_ms'):
+        column_roles('time=t,force=F,time=Zeit_ms')
 
 
 def test_options_of_bags_are_rejected_for_tables(tmp_path: Path) -> None:
