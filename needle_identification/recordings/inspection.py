@@ -40,6 +40,7 @@ from needle_identification.steering.reading import (
     read_steering_recording,
     steering_columns,
     STEERING_ROLES,
+    TIP_ALONG,
     USUAL,
 )
 from needle_identification.stiffness.identify import identify_stiffness
@@ -138,7 +139,7 @@ def _table(path: Path) -> Inspection:
     words += [f'factor: {name} = {value:g}' for name, value in table.scalars.items()]
     lacking = friction_table.missing_roles(roles)
     kind, unknown, columns_of = 'friction', '', roles
-    steered = steering_columns(table)
+    steered = _steering_columns(table, lacking)
     steerable = {*STEERING_ROLES} - {*steered} <= {'roll'}
     if steerable and (lacking or _guide_moves(table, steered)):
         words = [f'{role} by name and values: {spec}' for role, spec in steered.items()]
@@ -160,6 +161,21 @@ def _table(path: Path) -> Inspection:
         command=shlex.join(['needle', 'identify', kind, str(path), '--columns', named]),
         lacking=unknown,
     )  # fmt: skip
+
+
+def _steering_columns(table: tables.Table, lacking: Sequence[str]) -> dict[str, str]:
+    """Return the columns of a steered insertion; without friction, the depth may have any name."""
+    steered = steering_columns(table)
+    if not lacking or {*STEERING_ROLES} - {*steered} - {'roll'} != {'depth'}:
+        return steered
+    known = {*steered.values(), tables.guessed(table.columns).get('time')}
+    known |= {*tables.guessed(table.columns, TIP_ALONG).values()}
+    others = [name for name in table.columns if name not in known]
+    if len(others) != 1:
+        return {'depth': 'NAME', **steered}
+    depth = others[0]
+    sign = '-' if is_inverted(tables.measured_values(table.columns[depth])) else ''
+    return {**steering_columns(table, {'depth': depth}), 'depth': f'{sign}{depth}'}
 
 
 def _friction_roles(
@@ -189,6 +205,8 @@ def _with_units(table: tables.Table, specs: Mapping[str, str]) -> dict[str, str]
 
 def _refusal(table: tables.Table, columns: Mapping[str, str]) -> str:
     """Return why columns of a steered insertion are not usable, such as by their unit, or ''."""
+    if columns['depth'] == 'NAME':
+        return 'no column looks like depth: name it with --columns'
     try:
         check_depth(table, columns['depth'])
         for role, spec in columns.items():

@@ -7,6 +7,7 @@ from typing import Final
 
 from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.bags.bag import Bag
+from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
 from needle_identification.recordings import Roles, tables
 from needle_identification.recordings.merging import span_of
@@ -56,10 +57,13 @@ def read_sensor_recording(
     if not axes or len({*axes}) < len(axes) or not {*axes} <= {*AXES}:
         raise ParameterError(f'axes must be one or several of x, y, z, got {",".join(axes)!r}')
     path = Path(path)
-    stamps, tip, losses = _positions(path, TIP, tip_topic, axes, time, columns or {})
+    # In one bag the topic of the one is not that of the other.
+    is_same = isinstance(truth, (str, Path)) and Path(truth) == path
+    taken, tip_taken = (truth_topic, tip_topic) if is_same else (None, None)
+    stamps, tip, losses = _positions(path, TIP, tip_topic, axes, time, columns or {}, taken)
     if isinstance(truth, (str, Path)):
         true_stamps, true_tip, others = _positions(
-            Path(truth), _TRUTH, truth_topic, axes, time, truth_columns or {}
+            Path(truth), _TRUTH, truth_topic, axes, time, truth_columns or {}, tip_taken
         )
         losses += [f'true position: {loss}' for loss in others]
         if stamps[-1] < true_stamps[0] or true_stamps[-1] < stamps[0]:
@@ -85,11 +89,19 @@ def read_sensor_recording(
 
 
 def _positions(
-    path: Path, wanted: Wanted, topic: str | None, axes: Sequence[str], time: str, columns: Roles
+    path: Path,
+    wanted: Wanted,
+    topic: str | None,
+    axes: Sequence[str],
+    time: str,
+    columns: Roles,
+    taken: str | None,
 ) -> tuple[IntArray, FloatArray, list[str]]:
     """Return stamps [ns], (n,), positions on the axes [m], (n, k), and losses."""
     if not tables.is_table(path):
-        return _of_bag(path, wanted, topic, axes, time, columns)
+        bag = Bag(path)
+        among = [one for one in bag.topics() if topic is not None or one.name != taken]
+        return _of_bag(bag, chosen_topic(bag, among, wanted, topic), axes, time, columns)
     if topic is not None:
         option = wanted.option.replace('_', '-')
         raise RecordingError(f'{path} is a table: name columns instead of --{option}')
@@ -114,10 +126,8 @@ def _positions(
 
 
 def _of_bag(
-    path: Path, wanted: Wanted, name: str | None, axes: Sequence[str], time: str, columns: Roles
+    bag: Bag, topic: BagTopic, axes: Sequence[str], time: str, columns: Roles
 ) -> tuple[IntArray, FloatArray, list[str]]:
-    bag = Bag(path)
-    topic = chosen_topic(bag, bag.topics(), wanted, name)
     words = [columns.get(f'tip_{axis}', axis) for axis in axes]
     if topic.type_name == wire.JOINT_STATE:
         parsed = [signed(word) for word in words]

@@ -70,7 +70,7 @@ _LATERAL: Final = 0.1  # largest lateral motion [m]
 _FAR: Final = 2.0  # largest distance from the origin of a frame [m]
 _TURNS: Final = 4.0 * pi  #: largest roll [rad]
 _ALONG: Final = 0.5  # least motion of the tip along the needle over the insertion
-_TIP_ALONG: Final = {'along': ('tipy', 'ytip', 'tip2')}  # position along the needle
+TIP_ALONG: Final = {'along': ('tipy', 'ytip', 'tip2')}  #: Position along the needle.
 _RUN: Final = 10  # least mean number of rows of each of several insertions in one table
 _OUTSIDE: Final = 0.1  # depth of a needle that is withdrawn, as a part of the deepest
 _INSIDE: Final = 0.25  # depth of an insertion, as a part of the deepest
@@ -314,7 +314,7 @@ def _units(table: Table, specs: Mapping[str, str], given: Mapping[str, str]) -> 
 
 def _along(table: Table, depth: float, seen: BoolArray | slice) -> set[str]:
     """Return the unit in which the tip moves along the needle by the depth [m], if any."""
-    names = tables.guessed(table.columns, _TIP_ALONG)
+    names = tables.guessed(table.columns, TIP_ALONG)
     if 'along' not in names or not depth:
         return set()
     span = float(np.ptp(tables.measured_values(table.columns[names['along']][seen])))

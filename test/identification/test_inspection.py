@@ -347,6 +347,31 @@ def test_a_table_of_a_steered_insertion_is_recognized(tmp_path: Path) -> None:
     assert 'depth by name and values: -Base y[mm]' in found.words
 
 
+@pytest.mark.parametrize('sign', [1, -1])
+def test_a_steered_insertion_with_a_depth_of_any_name_is_recognized(
+    tmp_path: Path, sign: int
+) -> None:
+    """The depth is the only other column; else it must be named."""
+    path = tmp_path / 'gel.csv'
+    head = 't,robot_mm,base.x,base.z,tip.x,tip.y,tip.z'
+    rows = [f'{k},{5 * sign * k},{1 + k},{2 + k},{0.1 * k},{5 * k},{0.2 * k}' for k in range(9)]
+    path.write_text('\n'.join([head, *rows]) + '\n', encoding='utf-8')
+    found = inspect_recording(path)
+    columns = shlex.split(found.command)[-1]
+    depth = f'depth={"-" * (sign < 0)}robot_mm'
+    assert (
+        columns == f'{depth},guide_x=base.x[mm],guide_z=base.z[mm],tip_x=tip.x[mm],tip_z=tip.z[mm]'
+    )
+    assert not found.lacking
+    read = read_steering_recording(path, columns=column_roles(columns, STEERING_ROLES))
+    assert read.depth.max() == pytest.approx(0.04)
+    text = '\n'.join([f'{head},state', *(f'{row},1' for row in rows)])
+    path.write_text(f'{text}\n', encoding='utf-8')
+    found = inspect_recording(path)
+    assert found.lacking == 'no column looks like depth: name it with --columns'
+    assert found.command.startswith(f'needle identify steering {path} --columns depth=NAME,')
+
+
 def test_a_missing_recording_gives_a_one_line_error(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(RecordingError, match='does not exist'):
         inspect_recording('nowhere')

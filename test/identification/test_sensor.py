@@ -377,6 +377,27 @@ def test_a_bag_has_topics_of_sensor_and_true_position(tmp_path: Path) -> None:
         read_sensor_recording(path, path)
 
 
+def test_the_topic_that_is_left_is_that_of_the_sensor(tmp_path: Path) -> None:
+    """With the other named, in the same bag."""
+    one, path, point = (
+        recorded(moving=True, noise=1.8e-4),
+        tmp_path / 'run',
+        contract.TIP_DEFLECTION,
+    )
+    with BagWriter(path) as bag:
+        for name, positions in (('/aurora', one.tip), ('/robot_tip', one.true_tip)):
+            bag.add_topic(name, point.type_name)
+            for time, row in zip(one.time, positions, strict=True):
+                stamp = 1_700_000_000_000_000_000 + round(1e9 * time)
+                bag.write(name, point.template().serialize(stamp, *row.tolist()), stamp)
+    for given in ({'truth_topic': '/robot_tip'}, {'tip_topic': '/aurora'}):
+        found = read_sensor_recording(path, path, **given)
+        np.testing.assert_allclose(found.tip, one.tip, rtol=1e-12)
+        np.testing.assert_allclose(found.true_tip, one.true_tip, rtol=1e-12)
+    with pytest.raises(RecordingError, match='must name one of /aurora, /robot_tip'):
+        read_sensor_recording(path, str(tmp_path / '.' / 'run'))
+
+
 def run(capsys: pytest.CaptureFixture[str], *words: str, status: int = 0) -> tuple[str, str]:
     assert main(['identify', 'sensor', *words]) == status
     said = capsys.readouterr()
