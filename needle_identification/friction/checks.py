@@ -41,8 +41,14 @@ def fit_warnings(
     parameters: Sequence[ParameterEstimate],
     lag: ParameterEstimate,
     coarse: float,
+    described: bool = True,
 ) -> Iterator[str]:
-    """Yield warnings; ``coarse`` is the corrected lag [s] if ``lag`` is not determined."""
+    """
+    Yield warnings.
+
+    ``coarse`` is the corrected lag [s] if ``lag`` is not determined; ``described`` is whether the
+    terms describe the friction, otherwise the residual is no noise.
+    """
     unknown = [parameter.name for parameter in parameters if not parameter.determined]
     if unknown:
         cure = f'use more speeds, or fewer terms{design.signals.noise_remedy}'
@@ -84,7 +90,8 @@ def fit_warnings(
             'at reversals the force does not follow the terms (presliding or breakaway), which '
             'changes the estimates: without reversals these samples are left out'
         )
-    yield from _of_memory(design, fit)
+    if described:
+        yield from _of_memory(design, fit)
     known = {parameter.name: parameter for parameter in parameters if parameter.determined}
     if {'moving_mass', 'viscous_friction'} <= set(known):
         mass = 1e-3 * known['viscous_friction'].value

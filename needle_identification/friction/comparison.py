@@ -5,22 +5,28 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import inf, log, nan
+from math import inf, log, nan, prod
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.regression import Regression, score_covariance, wald_test
 from needle_identification.estimation.screening import Screening, Trial
 from needle_identification.friction.design import Design
-from needle_identification.friction.settings import LINEAR, TERMS
+from needle_identification.friction.search import (
+    speed_option,
+    TRIED,
+    with_decay_time,
+    with_stribeck_speed,
+)
+from needle_identification.friction.settings import FrictionSettings, LINEAR, TERMS
 from needle_identification.friction.terms import columns_of
 import numpy as np
+from scipy.special import chdtrc
 
 SIGNIFICANCE: Final = 0.02  #: probability of a false alarm of all comparisons
 _LIKE_MEMORY: Final = 1.5  # growth of the errors that two missing terms may explain
-_DECAY_TIMES: Final = np.geomspace(1 / 32, 1 / 2, 9)  # tried (Bonferroni), of the recording
 _SLOW: Final = 1e-4  # SIGNIFICANCE of each term beside slow noise, which may resemble it
+_OTHER: Final = 1e-3  # probability of a false alarm that another Stribeck speed fits better
 _FOLDS: Final = 5  # folds of the cross-validation over strokes
 _POSITIVE: Final = ('inertia', 'stribeck', 'cutting')  # terms whose coefficient cannot be negative
 
@@ -40,11 +46,18 @@ class CandidateFit:
 
 def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[CandidateFit, ...]:
     """Add each unused term, leave out each chosen term; among: number of recordings."""
-    chosen, screening = design.signals.settings.terms, design.screening
+    settings, screening = design.signals.settings, design.screening
+    chosen = settings.terms
     samples = _independent_samples(design, fit)
     if 'decay' not in chosen:
-        design = _with_decay_time(design, fit.residual)
-    comparison = _Comparison(design, fit, screening, samples, SIGNIFICANCE / among)
+        design = with_decay_time(design, fit.residual)
+    searched = dict(TRIED)
+    given = settings.stribeck_speed != FrictionSettings().stribeck_speed
+    if given or settings.reversals or 'stribeck' in chosen:
+        del searched['stribeck']
+    else:
+        design = with_stribeck_speed(design)
+    comparison = _Comparison(design, fit, screening, samples, SIGNIFICANCE / among, searched)
     singles = [(term,) for term in _candidates(design)]
     found = comparison.added(singles)
     growth = 1.0 if fit.memory is None else float(fit.memory.inflation.max())
@@ -56,18 +69,6 @@ def compare_terms(design: Design, fit: Regression, among: int = 1) -> tuple[Cand
         if len(chosen) > 1 and not ('direction' in chosen and term in ('coulomb', 'viscous')):
             found.append(comparison.removed(term))
     return tuple(found)
-
-
-def _with_decay_time(design: Design, residual: FloatArray) -> Design:
-    """Set the time constant of the term `decay` to the one that explains most of the residual."""
-    signals, parts = design.signals, design.parts
-    time = parts.means(signals.time - signals.time[0])
-    times = _DECAY_TIMES * (signals.time[-1] - signals.time[0])
-    x, z = parts.means(design.regressors(signals.settings.terms)), np.exp(-time / times[:, None]).T
-    z -= x @ np.linalg.lstsq(x, z, rcond=None)[0]
-    explained = (parts.means(residual) @ z) ** 2 / (z**2).sum(axis=0)
-    settings = replace(signals.settings, decay_time=float(times[np.argmax(explained)]))
-    return replace(design, signals=replace(signals, settings=settings))
 
 
 def _candidates(design: Design) -> list[str]:
@@ -86,19 +87,42 @@ def _candidates(design: Design) -> list[str]:
     return [term for term in TERMS if term not in excluded and design.reaches(term)]
 
 
+def other_speed(design: Design, fit: Regression) -> str:
+    """Return a warning if the term `stribeck` fits better with another speed."""
+    settings = design.signals.settings
+    if 'stribeck' not in settings.terms:
+        return ''
+    other = with_stribeck_speed(design)
+    if other.signals.settings.stribeck_speed == settings.stribeck_speed:
+        return ''
+    with suppress(IdentificationError):
+        better = other.solve(settings.terms, settings.estimator)
+        gain = log(float(fit.residual @ fit.residual) / float(better.residual @ better.residual))
+        ratio = max(_independent_samples(other, better) * gain, 0.0)
+        # Likelihood ratio of one more parameter.
+        p_value = min(TRIED['stribeck'] * float(chdtrc(1.0, ratio)), 1.0)
+        if p_value < _OTHER:
+            return (
+                f'the term stribeck fits better with {speed_option(other.signals.settings)} '
+                f'(p = {p_value:.2g}): the intervals do not hold'
+            )
+    return ''
+
+
 class _Comparison(NamedTuple):
-    """A fit, its screening, its number of independent samples, and the level of the tests."""
+    """A fit, its screening, its independent samples, level, and constants tried by term."""
 
     design: Design
     fit: Regression
     screening: Screening
     samples: float
     level: float
+    searched: dict[str, int]
 
     def added(self, candidates: Sequence[tuple[str, ...]]) -> list[CandidateFit]:
         """Fit additional terms; a supported term must also improve the prediction."""
         tried = [self._tried(more) for more in candidates]
-        searched = [len(_DECAY_TIMES) if 'decay' in more else 1 for more in candidates]
+        searched = [prod(self.searched.get(term, 1) for term in more) for more in candidates]
         p_values = _holm(np.multiply([trial.p_value for trial in tried], searched).tolist())
         # The residual without a missing term is no noise: samples of the best fit.
         known = [(trial.misfit, trial.samples) for trial in tried if trial.samples]
@@ -156,6 +180,8 @@ class _Comparison(NamedTuple):
         )
         if 'decay' in more:
             sizes += f' with decay_time {settings.decay_time:.2g} s'
+        if 'stribeck' in more:
+            sizes += f' with {speed_option(settings)}'
         words = f'the data {verdict} {name}: {sizes} (p = {p_value:.2g})'
         if not better:
             words += ', which does not predict better'

@@ -15,12 +15,13 @@ from math import nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.memory import Memory
 from needle_identification.estimation.prediction import moments
 from needle_identification.estimation.regression import Regression
 from needle_identification.estimation.residual_tests import residual_tests, ResidualTest
 from needle_identification.friction import checks
 from needle_identification.friction.breakaway import breakaway_force
-from needle_identification.friction.comparison import CandidateFit, compare_terms
+from needle_identification.friction.comparison import CandidateFit, compare_terms, other_speed
 from needle_identification.friction.design import Design, select_samples
 from needle_identification.friction.estimate import Fit, FrictionEstimate
 from needle_identification.friction.filtering import filter_signals, FilteredSignals, HALF_LENGTH
@@ -34,6 +35,7 @@ from needle_identification.friction.lag import (
 )
 from needle_identification.friction.punctures import find_punctures
 from needle_identification.friction.settings import AUTO, FrictionSettings
+from needle_identification.friction.steady import misfit_at_speeds
 from needle_identification.recordings.recording import Recording
 from needle_identification.recordings.units import UNITS
 import numpy as np
@@ -253,19 +255,16 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
     lag = lag_estimate(design, fit)
     tests: tuple[ResidualTest, ...] = ()
     comparison: tuple[CandidateFit, ...] = ()
+    misfit, doubts = None, []
     if fit.memory is not None and not fit.is_exact:
-        tests = residual_tests(
-            fit.residual,
-            time=signals.time,
-            velocity=design.velocity,
-            parts=design.parts,
-            memory=fit.memory,
-            parameters=len(fit.values),
-        )
+        misfit = misfit_at_speeds(design)
+        # The other tests need residuals that are noise.
+        tests = (misfit,) if misfit else _residual_tests(design, fit, fit.memory)
         comparison = compare_terms(design, fit, among)
-    missing = checks.missing_term(settings.terms, comparison)
-    doubts = [missing] if missing else [test.words for test in tests if test.failed]
-    warnings = checks.fit_warnings(design, fit, parameters, lag, chosen.coarse)
+        doubts = [other_speed(design, fit), checks.missing_term(settings.terms, comparison)]
+    if misfit or not any(doubts):
+        doubts = [*(test.words for test in tests if test.failed), *doubts]
+    warnings = checks.fit_warnings(design, fit, parameters, lag, chosen.coarse, not misfit)
     return FrictionEstimate(
         name=name,
         terms=settings.terms,
@@ -281,7 +280,7 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
         condition=fit.condition,
         tests=tests,
         comparison=comparison,
-        warnings=(*chosen.remarks, *warnings, *doubts),
+        warnings=(*chosen.remarks, *warnings, *filter(None, doubts)),
         fit=Fit(
             time=signals.time,
             velocity=design.velocity,
@@ -290,4 +289,15 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
             used=used,
             moments=moments(design.columns(settings.terms)[used], fit.residual[used], known),
         ),
+    )
+
+
+def _residual_tests(design: Design, fit: Regression, memory: Memory) -> tuple[ResidualTest, ...]:
+    return residual_tests(
+        fit.residual,
+        time=design.signals.time,
+        velocity=design.velocity,
+        parts=design.parts,
+        memory=memory,
+        parameters=len(fit.values),
     )
