@@ -14,8 +14,8 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import ceil, cos, hypot, pi, sin
 from pathlib import Path
+import re
 from typing import Any, Final, NamedTuple
-from zlib import crc32
 
 from needle_controller.steering.contact import monitored
 from needle_controller.steering.insertion_plan import (
@@ -32,10 +32,17 @@ from needle_controller.steering.law import (
     GuideSetpoint,
     LawError,
     SteeringFaultError,
+    SteeringLaw,
 )
 from needle_controller.steering.planned_path import PlannedPath
+from needle_controller.steering.planner import check_plan
 from needle_controller.steering.responses import SteeringModel
-from needle_controller.steering.settings import ContactSettings, SteeringLimits, SteeringPrior
+from needle_controller.steering.settings import (
+    ContactSettings,
+    ExecutiveSettings,
+    SteeringLimits,
+    SteeringPrior,
+)
 from needle_controller.steering.simulation import (
     simulate_steering,
     SteeringPlant,
@@ -52,11 +59,11 @@ from needle_dynamics.steering.parameters import (
     with_layers,
     with_lengths,
 )
-from needle_planning.anatomy import Anatomy, Structure
-from needle_planning.certificate import least_clearances, sag_of
-from needle_planning.clearance import Clearance
+from needle_planning.anatomy import Anatomy, SegmentationError, Structure
+from needle_planning.certificate import least_clearances, sag_of, simulate_insertion
+from needle_planning.clearance import Clearance, image_frame
 from needle_planning.labels import read_anatomy, read_labels
-from needle_planning.paths import Line
+from needle_planning.paths import Line, needle_radius
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
 from needle_study import scenario
@@ -71,6 +78,13 @@ _SEEDS: Final = 2**63  #: Upper bound of the seeds of paths.
 _SPACING: Final = 5e-3
 _TIGHT: Final = 5e-5  #: Largest difference between the bound and the true clearance [m].
 _BEYOND: Final = 0.02  #: Distance from the line within which the clearance is exact [m].
+#: Largest difference of two lower bounds of a clearance, and of positions in single precision [m].
+_SAME: Final = _TIGHT + 2e-6
+_ROUNDED: Final = 1e-3  #: Tolerance of an index of a voxel.
+_SAME_RADIUS: Final = 1e-7  #: Largest difference of the radius of the same needle [m].
+_NRRD: Final = ('.nrrd', '.nhdr')
+#: Field of a header of NRRD whose data are in another file.
+_DATA_FILE: Final = re.compile(rb'(?im)^data ?file *: *([^\r\n]*[^\r\n ])')
 _FILES: Final = ('plan', 'segmentation', 'labels')
 _PARTS: Final = ('folder', 'law', 'prior', 'contact', *_FILES)
 
@@ -128,16 +142,17 @@ class _Numbers(SteeringLimits):
     )
 
 
-def _checksum(name: str) -> str:
-    """Return the checksum of a file, or of all files of a folder."""
-    path, value = Path(name).expanduser(), 0
-    try:
-        found = sorted(one for one in path.iterdir() if one.is_file()) if path.is_dir() else [path]
-        for one in found:
-            value = crc32(one.read_bytes(), value)
-    except OSError as error:
-        raise ParameterError(f'settings: {name}: {error.strerror}') from error
-    return f'{value:08x}'
+def _files_of(name: str) -> list[Path]:
+    """Return the files that are read for a name: of a folder all, of NRRD also the data file."""
+    path = Path(name).expanduser()
+    if path.is_dir():
+        return sorted(one for one in path.iterdir() if one.is_file())
+    if not (path.is_file() and name.lower().endswith(_NRRD)):
+        return [path]
+    header, *_ = re.split(rb'\r?\n\r?\n', path.read_bytes(), maxsplit=1)
+    found = _DATA_FILE.search(header)
+    beside = path.parent / found[1].decode(errors='replace') if found else path
+    return [path, beside] if found and beside.is_file() else [path]
 
 
 class _Inputs(NamedTuple):
@@ -150,6 +165,38 @@ class _Inputs(NamedTuple):
     steering: SteeringParameters
     clearance: Clearance
     model: SteeringModel  #: nominal model
+
+
+def _holds(anatomy: Anatomy, point: FloatArray) -> bool:
+    frame = image_frame(anatomy)
+    index = frame.of_patient(point) / frame.spacing
+    ends = np.array(anatomy.labels.shape) - 0.5
+    return bool((index >= -0.5 - _ROUNDED).all() and (index <= ends + _ROUNDED).all())
+
+
+def _check(plan: Plan, inputs: _Inputs, limits: SteeringLimits) -> None:
+    """Raise `ParameterError` if a plan is not of these inputs and limits."""
+    # A straight needle in open loop needs no guide.
+    if limits.guide_limit or plan.guide.any():
+        steps = ExecutiveSettings(guide_limit=limits.guide_limit, guide_step=limits.guide_step)
+        check_plan(plan, steps)
+    radius = needle_radius(inputs.needle)
+    if abs(radius - plan.radius) > _SAME_RADIUS:
+        raise ParameterError(
+            f'the needle {plan.needle} has a radius of {1e3 * radius:.4g} mm, and in the plan '
+            f'{1e3 * plan.radius:.4g} mm: plan again'
+        )
+    found = simulate_insertion(
+        inputs.clearance, inputs.line, inputs.needle, inputs.steering, plan.depths, plan.guide,
+        plan.roll,
+    ).clearances  # fmt: skip
+    k = int(np.abs(found - plan.clearances).argmax())
+    if abs(found[k] - plan.clearances[k]) > _SAME:
+        raise ParameterError(
+            f'the clearance at a depth of {1e3 * plan.depths[k]:.1f} mm is {1e3 * found[k]:.2f} '
+            f'mm, and in the plan {1e3 * plan.clearances[k]:.2f} mm: the plan is of another '
+            'segmentation, other labels or another needle'
+        )
 
 
 class PlanScenario(Scenario):
@@ -174,6 +221,7 @@ class PlanScenario(Scenario):
             raise ParameterError(
                 f'settings.turns must be 0: a plan has none, got {given["turns"]}'
             )
+        self._plan: Plan | None = None  # without one, that of the folder
         self._source, self._images, self._labels = self._sources(settings)
         self._law = str(settings.get('law', DEFAULT_LAW))
         find_law(self._law)
@@ -183,6 +231,9 @@ class PlanScenario(Scenario):
         self._contact = from_values(
             ContactSettings, {'limit': 1.0, **contact}, 'settings.contact.'
         )
+        layers = LAYERS if self._plan is None else LAYERS[: len(self._plan.layers)]
+        self.absent = dict.fromkeys(LAYERS, f'is not in the plan, which has {len(layers)} layers')
+        self.absent = {name: one for name, one in self.absent.items() if name not in layers}
         of_prior, bevel = self._prior, 'load of the bevel beyond the nominal one'
         self.variables: Mapping[str, Variable] = {
             'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
@@ -190,7 +241,7 @@ class PlanScenario(Scenario):
                 1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3
             ),
             **dict.fromkeys(
-                LAYERS, Variable(1.0, '1', 'stiffness of a layer over its median', 0.01, 100.0)
+                layers, Variable(1.0, '1', 'stiffness of a layer over its median', 0.01, 100.0)
             ),
             'bevel_x': Variable(0.0, 'N', bevel, -1e3, 1e3),
             'bevel_z': Variable(0.0, 'N', bevel, -1e3, 1e3),
@@ -246,16 +297,33 @@ class PlanScenario(Scenario):
         files = [settings['plan'], settings['labels'], *images]
         if not all(isinstance(name, str) for name in files):
             raise ParameterError(f'settings: {", ".join(_FILES)} must be names of files')
-        read_plan(settings['plan'])
+        if 'step_length' in settings:
+            raise ParameterError('settings: step_length must be omitted: the plan has its depths')
+        self._plan = read_plan(settings['plan'])
         read_labels(settings['labels'])
-        self.files = {name: _checksum(name) for name in files}
+        self.files = {
+            **{name: scenario.checksum(name, _files_of(name)) for name in files},
+            **scenario.needle_files(self._plan.needle),
+        }
         return Path(settings['plan']), images, settings['labels']
+
+    def check(self) -> None:
+        """Raise `ParameterError` for a plan of another anatomy or needle, or beyond the limits."""
+        if self._plan is None:
+            return
+        try:
+            _check(self._plan, self._inputs, self._limits)
+            self._law_along(self._inputs)
+        except (ParameterError, SegmentationError) as error:
+            raise ParameterError(f'settings: {error}') from error
 
     @cached_property
     def _inputs(self) -> _Inputs:
         """Content of the files, which only insertions need."""
-        if self._images:
-            plan, anatomies = read_plan(self._source), read_anatomy(self._images, self._labels)
+        if self._plan is not None:
+            plan, anatomies = self._plan, read_anatomy(self._images, self._labels)
+            if not any(_holds(one, plan.target) for one in anatomies):
+                raise ParameterError(f'the target of the plan is not in {", ".join(self._images)}')
         else:
             plan, anatomies = read_plan(self._source / _PLAN), _read_anatomies(self._source)
         preset = find_needle(plan.needle)
@@ -295,12 +363,9 @@ class PlanScenario(Scenario):
             dropout=row['lost'], **{name: row[name] for name in SENSOR_ERRORS}
         )
         sensor = SteppedTipSensor(plant, row['tip_noise'], errors, seed, rng, rng)
-        limits, path = replace(self._limits, turns=0), inputs.path
-        law = build_law(self._law, inputs.model, path.tips[-1], limits, inputs.plan.roll, path)
-        law = monitored(law, inputs.model, inputs.plan, path, limits, self._contact)
-        stopped = False
+        law, stopped = self._law_along(inputs), False
         try:
-            simulate_steering(law, plant, sensor, limits=limits, roll=inputs.plan.roll)
+            simulate_steering(law, plant, sensor, limits=self._limits, roll=inputs.plan.roll)
         except LawError:
             raise
         except SteeringFaultError:
@@ -319,6 +384,12 @@ class PlanScenario(Scenario):
             'stopped': stopped,
         }  # fmt: skip
         return {name: float(value) for name, value in metrics.items()}, shafts
+
+    def _law_along(self, inputs: _Inputs) -> SteeringLaw:
+        """Return the law of an insertion along the plan, with the monitoring of contact."""
+        plan, path, limits = inputs.plan, inputs.path, self._limits
+        law = build_law(self._law, inputs.model, path.tips[-1], limits, plan.roll, path)
+        return monitored(law, inputs.model, plan, path, limits, self._contact)
 
     def _plant(self, row: Row, seed: int) -> _PlannedPlant:
         lengths = row['bending_length'], row['skin']

@@ -6,7 +6,9 @@ import csv
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain, repeat
+from math import isfinite, nan
 from pathlib import Path
+from reprlib import repr as short
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray
@@ -194,14 +196,39 @@ def from_table(name: str, given: Any, folder: Path) -> Any:
     file, column = where
     try:
         with (folder / file).open(encoding='utf-8-sig', newline='') as stream:
-            reader = csv.DictReader(stream)
-            rows = list(reader)
-        return {_ROWS: [float(row[column]) for row in rows], _OF: file}
-    except KeyError:
-        has = ', '.join(reader.fieldnames or ())
-        raise ParameterError(f'{name}: {file} has no column {column!r}, it has {has}') from None
-    except (OSError, ValueError, TypeError, csv.Error) as error:
+            rows = [row for row in csv.reader(stream) if row]
+    except (OSError, ValueError, csv.Error) as error:
         raise ParameterError(f'{name}: {file} cannot be read: {error}') from error
+    return {_ROWS: _column(f'{name}: {file}', rows, column), _OF: file}
+
+
+def _column(where: str, rows: Sequence[Sequence[str]], column: str) -> list[float]:
+    """Return the numbers of a column of a table; its header is row 1."""
+    header = rows[0] if rows else []
+    if len(rows) < 2:
+        raise ParameterError(f'{where} must have a header and rows, and has {len(rows)} rows')
+    if column not in header:
+        raise ParameterError(f'{where} has no column {column!r}, it has {", ".join(header)}')
+    if header.count(column) > 1:
+        raise ParameterError(f'{where} has {header.count(column)} columns {column!r}')
+    at, found = header.index(column), []
+    for number, row in enumerate(rows[1:], 2):
+        if len(row) != len(header):
+            raise ParameterError(
+                f'{where}: row {number} has {len(row)} cells, and the header {len(header)}, with '
+                f'the column {column!r}; a decimal comma needs a decimal point instead'
+            )
+        try:
+            value = float(row[at])
+        except ValueError:
+            value = nan
+        if not isfinite(value):
+            raise ParameterError(
+                f'{where}: row {number}, column {column!r} must be a finite number, got '
+                f'{short(row[at])}'
+            )
+        found.append(value)
+    return found
 
 
 def _numbers(name: str, given: Any, *units: str) -> tuple[float, ...]:

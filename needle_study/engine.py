@@ -117,12 +117,15 @@ class Results:
         self._parts, self._file = folder / 'parts', folder / STUDY
         if self._file.is_file():
             if self._begun()['study'] != json.loads(order(study))['study']:
-                raise ParameterError(f'{folder} belongs to another study; name another folder')
+                self._begin_again()
         # A process that was killed at the start leaves a draft, or nothing.
         elif folder.exists() and any(path.suffix != '.tmp' for path in folder.iterdir()):
             raise ParameterError(f'{folder} exists and is not a study; name another folder')
         else:
-            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ParameterError(f'{folder} cannot be written: {error.strerror}') from error
             write_whole(self._file, order(study).encode())
         if self.table.exists():
             if not self._is_intact():
@@ -130,6 +133,15 @@ class Results:
             shutil.rmtree(self._parts, ignore_errors=True)
         else:
             self._parts.mkdir(exist_ok=True)
+
+    def _begin_again(self) -> None:
+        """Replace another study without a sample, as after an invalid input."""
+        self._parts.mkdir(exist_ok=True)
+        with suppress(JobError), self._locked():
+            if not self.table.exists() and not self._done():
+                write_whole(self._file, order(self.study).encode())
+                return
+        raise ParameterError(f'{self.folder} belongs to another study; name another folder')
 
     def _begun(self) -> dict[str, Any]:
         """Return the study in the folder, and the package versions of its start."""
@@ -140,15 +152,22 @@ class Results:
             raise ParameterError(f'{self._file} is not a study; name another folder') from error
 
     @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Lock the folder and remove damaged parts; JobError if locked or of another version."""
-        _check_versions(self._begun()['versions'], f'the study in {self.folder}')
-        self._parts.mkdir(exist_ok=True)
+    def _locked(self) -> Iterator[None]:
         with (self._parts / 'lock').open('w') as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise JobError(f'another process computes {self.folder}') from error
+            yield
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Lock the folder and remove damaged parts; JobError if locked or of another version."""
+        _check_versions(self._begun()['versions'], f'the study in {self.folder}')
+        self._parts.mkdir(exist_ok=True)
+        with self._locked():
+            if self._begun()['study'] != json.loads(order(self.study))['study']:
+                raise JobError(f'{self.folder} belongs to another study now')
             end = 0
             for part in [] if self.table.exists() else self._done():
                 intact = _checksum(part.first, part.end, _blocks(part.path)) == part.checksum

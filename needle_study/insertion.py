@@ -122,11 +122,13 @@ class InsertionScenario(Scenario):
             scenario.mapping(f'settings: {name}', settings.get(name))
             for name in ('constants', 'gains', 'uncertainty')
         )
+        needle = settings.get('needle', PAPER_NEEDLE)
         self._needle = from_values(
             NeedleParameters,
-            {**asdict(find_needle(settings.get('needle', PAPER_NEEDLE)).needle), **constants},
+            {**asdict(find_needle(needle).needle), **constants},
             'settings.constants.',
         )
+        self.files = scenario.needle_files(needle)
         self._kind = control.REFERENCES[words['reference']]
         self._period = 1.0 / self._numbers.rate
         self._limits = control.SafetyLimits(

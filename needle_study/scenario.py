@@ -5,9 +5,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import inf, nan
 from numbers import Real
+from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
+from zlib import crc32
 
 from needle_dynamics import FloatArray
+from needle_dynamics.needles import FILES, NEEDLES
 from needle_ros.contract import Topic
 from needle_ros.errors import ParameterError
 from needle_ros.settings import unknown_name
@@ -50,6 +53,10 @@ class Scenario(ABC):
     at_once: int  #: samples that are simulated together
     #: Checksum of each file that it reads: with another content, the study is another one.
     files: Mapping[str, str] = {}
+    absent: Mapping[str, str] = {}  #: Reason why a variable is not in this study, by its name.
+
+    def check(self) -> None:  # noqa: B027
+        """Raise `ParameterError` for invalid content of files, before a folder is made."""
 
     def run(self, samples: Mapping[str, FloatArray], streams: Streams) -> dict[str, FloatArray]:
         """Simulate samples; return each metric, shape (n,): 1 for yes, NaN for a missing value."""
@@ -106,6 +113,23 @@ def check_names(where: str, given: Iterable[Any], valid: Iterable[str]) -> None:
     for name in given:
         if name not in known:
             raise ParameterError(f'{where}{unknown_name(str(name), known)}')
+
+
+def checksum(name: str, paths: Iterable[Path] = ()) -> str:
+    """Return the checksum of the file `name` of the settings, or of the paths that it means."""
+    value = 0
+    try:
+        for path in paths or [Path(name).expanduser()]:
+            value = crc32(path.read_bytes(), value)
+    except OSError as error:
+        raise ParameterError(f'settings: {name}: {error.strerror}') from error
+    return f'{value:08x}'
+
+
+def needle_files(needle: Any) -> dict[str, str]:
+    """Return the checksum of the file of a needle by its name, nothing for a known needle."""
+    is_file = isinstance(needle, str) and needle not in NEEDLES and needle.endswith(FILES)
+    return {needle: checksum(needle)} if is_file else {}
 
 
 def mapping(name: str, value: Any) -> Mapping[str, Any]:

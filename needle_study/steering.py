@@ -97,7 +97,9 @@ class SteeringScenario(Scenario):
         self._numbers = numbers = from_values(
             SteeringStudy, {**asdict(SIMULATION_LIMITS), **given}, 'settings.'
         )
-        nominal = find_needle(settings.get('needle', DEFAULT_NEEDLE))
+        needle = settings.get('needle', DEFAULT_NEEDLE)
+        nominal = find_needle(needle)
+        self.files = scenario.needle_files(needle)
         self._law = str(settings.get('law', DEFAULT_LAW))
         find_law(self._law)
         constants = scenario.mapping('settings: constants', settings.get('constants'))

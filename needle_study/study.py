@@ -137,7 +137,9 @@ def read_study(path: Path | str) -> Study:
                 name: from_table(f'population: {name}', one, path.parent)
                 for name, one in given.items()
             }
-        return build_study(document)
+        study = build_study(document)
+        study.scenario.check()
+        return study
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
 
@@ -158,7 +160,7 @@ def build_study(document: Any) -> Study:
     """
     if not isinstance(document, Mapping):
         raise ParameterError(f'a study has {", ".join(_KEYS)}, got {document!r}')
-    check_names('', document, (*_KEYS, _FILES))
+    check_names('', (key for key in document if key != _FILES), _KEYS)
     of_class = find_class('scenario', document.get('scenario'), SCENARIOS)
     if not (isinstance(of_class, type) and Scenario in of_class.__mro__):
         raise ParameterError(f'scenario {document["scenario"]!r} is not a subclass of Scenario')
@@ -170,6 +172,9 @@ def build_study(document: Any) -> Study:
     settings, given = (mapping(key, document.get(key)) for key in ('settings', 'population'))
     scenario: Scenario = of_class(settings)
     known = scenario.variables
+    for name in given:
+        if name in scenario.absent:
+            raise ParameterError(f'population: {name} {scenario.absent[name]}')
     check_names('population: ', given, known)
     # The dimension of a variable must not depend on its order in the file: workers sort it.
     population = {

@@ -959,6 +959,13 @@ def test_invalid_studies_are_rejected(
     ('text', 'complaint'),
     [
         ('a,b\n1,2,3\n', "a.csv has no column 'skin', it has a, b"),
+        ('', 'a.csv must have a header and rows, and has 0 rows'),
+        ('skin,a\n', 'a.csv must have a header and rows, and has 1 rows'),
+        ('skin,a\n1,2\n0,9,0,8\n', 'a.csv: row 3 has 4 cells, and the header 2, with the column'),
+        ('a,skin\n1,2\n1\n', "a.csv: row 3 has 1 cells, and the header 2, with the column 'skin'"),
+        ('skin,a\n,2\n', "a.csv: row 2, column 'skin' must be a finite number, got ''"),
+        ('skin,a\n1,2\nnan,2\n', "a.csv: row 3, column 'skin' must be a finite number, got 'nan'"),
+        ('skin,a,skin\n1,2,3\n', "a.csv has 2 columns 'skin'"),
         (f'skin\n"{"1" * 200_000}"\n', 'a.csv cannot be read: field larger than'),
     ],
 )
@@ -968,6 +975,43 @@ def test_invalid_tables_are_rejected(
     (tmp_path / 'a.csv').write_text(text)
     change = {'population': {'skin': {'table': ['a.csv', 'skin']}}}
     check_refused({**SMALL, **change}, complaint, tmp_path, capsys)
+
+
+def test_a_changed_needle_file_is_another_study(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Results of two needles are not mixed."""
+    needle, file = tmp_path / 'mine.yaml', tmp_path / 'study.yaml'
+    needle.write_text('length: 0.15\n')
+    settings = {**SMALL['settings'], 'needle': str(needle)}
+    file.write_text(yaml.safe_dump({**SMALL, 'settings': settings}))
+    words = ['study', str(file), '-o', str(tmp_path / 'results'), '--workers', '1']
+    assert main(words) == 0
+    capsys.readouterr()
+    needle.write_text('length: 0.16\n')
+    assert main(words) == 2
+    assert 'belongs to another study; name another folder' in capsys.readouterr().err
+
+
+def test_a_study_without_samples_is_replaced(tmp_path: Path) -> None:
+    """But not while another process computes it."""
+    other = build_study({**SMALL, 'seed': 4})
+    with (
+        Results(tmp_path / 'results', build_study(SMALL)).alone(),
+        pytest.raises(ParameterError, match='belongs to another study'),
+    ):
+        Results(tmp_path / 'results', other)
+    results = Results(tmp_path / 'results', other)
+    compute(results, here, 1, lambda _: None)
+    assert len(column(results.table, 'miss')) == other.samples
+
+
+def test_internal_key_is_not_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    check_refused({**SMALL, 'qqqq': 1}, 'valid: correlations, design, pop', tmp_path, capsys)
+    file = tmp_path / 'study.yaml'
+    file.write_text(yaml.safe_dump({**SMALL, 'qqqq': 1}))
+    assert main(['study', str(file)]) == 2
+    assert 'files' not in capsys.readouterr().err
 
 
 def test_unusable_files_and_folders_are_rejected(
@@ -980,9 +1024,12 @@ def test_unusable_files_and_folders_are_rejected(
     (tmp_path / 'other' / 'results').mkdir(parents=True)
     assert main(['study', str(file), '-o', str(tmp_path / 'other')]) == 2
     assert 'exists and is not a study; name another folder' in capsys.readouterr().err
-    Results(tmp_path / 'third', build_study({**SMALL, 'seed': 4}))
+    third = Results(tmp_path / 'third', build_study({**SMALL, 'seed': 4}))
+    third.add(0, third.study.rows(0, 16))
     assert main(['study', str(file), '-o', str(tmp_path / 'third')]) == 2
     assert 'belongs to another study; name another folder' in capsys.readouterr().err
+    assert main(['study', str(file), '-o', '/proc/x']) == 2
+    assert capsys.readouterr().err.startswith('error: /proc/x cannot be written: ')
     assert main(['study', str(file), '-o', str(tmp_path / 'x'), '--workers', '0']) == 2
     assert '--workers must be >= 1' in capsys.readouterr().err
 

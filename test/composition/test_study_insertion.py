@@ -389,3 +389,15 @@ def test_invalid_studies_are_rejected(
 ) -> None:
     """A one-line error names the file, and nothing is written."""
     check_refused({**SMALL, **change}, complaint, tmp_path, capsys)
+
+
+def test_a_needle_file_belongs_to_the_study(tmp_path: Path) -> None:
+    """Its checksum differs after a change."""
+    needle = tmp_path / 'mine.yaml'
+    found = []
+    for length in (0.2, 0.21):
+        needle.write_text(f'needle: phantom\nlength: {length}\n')
+        document = {'scenario': 'insertion', 'settings': {'needle': str(needle)}}
+        found.append(build_study(document).document['files'][str(needle)])
+    assert found[0] != found[1]
+    assert 'files' not in build_study({'scenario': 'insertion'}).document

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 import re
 from typing import Any
@@ -10,7 +11,8 @@ from typing import Any
 from needle_insertion.cli import main
 from needle_planning import chance_of, find_plan, read_anatomy, read_plan, write_plan
 from needle_planning.chance import POPULATION
-from needle_study import read_study
+from needle_study import build_study, read_study
+import nrrd
 import numpy as np
 import pytest
 from support.segmentations import write_labels, write_nrrd
@@ -90,6 +92,7 @@ def test_command_keeps_the_results_of_a_plan(
         ({'segmentation': 'none.nrrd'}, 'none.nrrd: No such file'),
         ({'radius': 0.0}, 'radius'),
         ({'turns': 1}, 'settings.turns must be 0'),
+        ({'step_length': 3e-3}, 'settings: step_length must be omitted'),
         ({'size': 1}, "'size'"),
     ],
 )
@@ -111,6 +114,75 @@ def test_file_that_a_worker_does_not_have_is_one_line(
     """Its checksum is in the study that the workers receive."""
     document = study_of(files) | {'files': {files['plan']: '00000000'}}
     check_refused(document, 'is not the file with which the study was begun', tmp_path, capsys)
+
+
+def test_a_changed_needle_file_is_another_study(
+    files: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The needle of a plan is a file of the study; its radius is that of the plan."""
+    needle, plan = tmp_path / 'mine.yaml', Path(files['plan'])
+    needle.write_text('length: 150mm\n')
+    plan.write_text(plan.read_text().replace('needle: bending_35mm', f'needle: {needle}'))
+    before = build_study(study_of(files)).document['files']
+    needle.write_text('length: 151mm\n')
+    after = build_study(study_of(files)).document['files']
+    assert {name for name in before if before[name] != after[name]} == {str(needle)}
+    needle.write_text('outer_diameter: 2.5mm\ninner_diameter: 1mm\n')
+    check_refused(study_of(files), 'has a radius of 1.25 mm, and in the plan', tmp_path, capsys)
+
+
+def test_data_file_of_a_detached_header_is_a_file_of_the_study(
+    files: dict[str, Any], tmp_path: Path
+) -> None:
+    labels, _ = nrrd.read(files['segmentation'])
+    image = write_nrrd(tmp_path / 'walls.nhdr', labels, LPS)
+    (data,) = tmp_path.glob('walls.raw*')
+    settings = {**files, 'segmentation': str(image)}
+    document = study_of(settings)
+    before = build_study(document).document['files'][str(image)]
+    data.write_bytes(data.read_bytes() + b'\0')
+    assert build_study(document).document['files'][str(image)] != before
+
+
+@pytest.mark.parametrize(
+    ('shift', 'reason'), [(3, 'the plan is of another segmentation'), (90, 'is not in ')]
+)
+def test_plan_of_another_segmentation_is_refused(
+    files: dict[str, Any],
+    shift: int,
+    reason: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Also after a failed start, the folder is free."""
+    labels, _ = nrrd.read(files['segmentation'])
+    moved = LPS.copy()
+    moved[0, 3] = -shift
+    write_nrrd(Path(files['segmentation']), labels, moved)
+    check_refused(study_of(files), reason, tmp_path, capsys)
+
+
+def test_plan_beyond_the_limits_is_refused(
+    files: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As by the node `steering`; a guide at rest is for an open loop."""
+    check_refused(study_of(files, guide_limit=0.0), ': settings: guide_limit', tmp_path, capsys)
+    plan = Path(files['plan'])
+    guide = read_plan(plan).guide.copy()
+    guide[1:, 0] = 1.5e-3
+    write_plan(replace(read_plan(plan), guide=guide), plan)
+    given = study_of(files, guide_limit='1mm')
+    check_refused(given, 'settings: the plan needs guide_limit >= 1.500 mm', tmp_path, capsys)
+    given = study_of(files, guide_step='1mm')
+    check_refused(given, 'settings: the plan needs guide_step >= 1.500 mm', tmp_path, capsys)
+
+
+def test_layers_without_a_plan_are_refused(
+    files: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    document = study_of(files) | {'population': {'layer_3': 1.0}}
+    reason = 'population: layer_3 is not in the plan, which has 0 layers'
+    check_refused(document, reason, tmp_path, capsys)
 
 
 def test_example_has_the_documented_uncertainty() -> None:
