@@ -206,7 +206,7 @@ def _column(where: str, rows: Sequence[Sequence[str]], column: str) -> list[floa
     """Return the numbers of a column of a table; its header is row 1."""
     header = rows[0] if rows else []
     if len(rows) < 2:
-        raise ParameterError(f'{where} must have a header and rows, and has {len(rows)} rows')
+        raise ParameterError(f'{where} must have a header and rows below it')
     if column not in header:
         raise ParameterError(f'{where} has no column {column!r}, it has {", ".join(header)}')
     if header.count(column) > 1:
@@ -215,8 +215,8 @@ def _column(where: str, rows: Sequence[Sequence[str]], column: str) -> list[floa
     for number, row in enumerate(rows[1:], 2):
         if len(row) != len(header):
             raise ParameterError(
-                f'{where}: row {number} has {len(row)} cells, and the header {len(header)}, with '
-                f'the column {column!r}; a decimal comma needs a decimal point instead'
+                f'{where}: row {number} must have {len(header)} cells as the header, also for the '
+                f'column {column!r}, got {len(row)}; numbers have a decimal point'
             )
         try:
             value = float(row[at])

@@ -136,11 +136,12 @@ class Results:
 
     def _begin_again(self) -> None:
         """Replace another study without a sample, as after an invalid input."""
-        self._parts.mkdir(exist_ok=True)
-        with suppress(JobError), self._locked():
-            if not self.table.exists() and not self._done():
-                write_whole(self._file, order(self.study).encode())
-                return
+        if not self.table.exists():
+            self._parts.mkdir(exist_ok=True)
+            with suppress(JobError), self._locked():
+                if not self._done():
+                    write_whole(self._file, order(self.study).encode())
+                    return
         raise ParameterError(f'{self.folder} belongs to another study; name another folder')
 
     def _begun(self) -> dict[str, Any]:

@@ -959,10 +959,13 @@ def test_invalid_studies_are_rejected(
     ('text', 'complaint'),
     [
         ('a,b\n1,2,3\n', "a.csv has no column 'skin', it has a, b"),
-        ('', 'a.csv must have a header and rows, and has 0 rows'),
-        ('skin,a\n', 'a.csv must have a header and rows, and has 1 rows'),
-        ('skin,a\n1,2\n0,9,0,8\n', 'a.csv: row 3 has 4 cells, and the header 2, with the column'),
-        ('a,skin\n1,2\n1\n', "a.csv: row 3 has 1 cells, and the header 2, with the column 'skin'"),
+        ('', 'a.csv must have a header and rows below it'),
+        ('skin,a\n', 'a.csv must have a header and rows below it'),
+        (
+            'skin,a\n1,2\n0,9,0,8\n',
+            "row 3 must have 2 cells as the header, also for the column 'skin', got 4",
+        ),
+        ('a,skin\n1,2\n1\n', 'a.csv: row 3 must have 2 cells as the header, also for the'),
         ('skin,a\n,2\n', "a.csv: row 2, column 'skin' must be a finite number, got ''"),
         ('skin,a\n1,2\nnan,2\n', "a.csv: row 3, column 'skin' must be a finite number, got 'nan'"),
         ('skin,a,skin\n1,2,3\n', "a.csv has 2 columns 'skin'"),
