@@ -266,8 +266,8 @@ def test_invalid_population_is_one_line(tmp_path: Path, text: str, reason: str) 
     [
         ({'insertions': 0}, 'insertions must be an integer from 1'),
         ({'workers': 0}, 'workers must be an integer from 1'),
-        ({'radius': 0.0}, 'radius must be > 0 m'),
-        ({'radius': float('nan')}, 'radius must be > 0 m'),
+        ({'radius': 0.0}, 'radius must be finite, > 0 m'),
+        ({'radius': float('nan')}, 'radius must be finite, > 0 m'),
         ({'population': {'entry_y': 1e-3}}, 'entry_y'),
         ({'population': {'entry_x': {'normal': [0.0]}}}, 'entry_x: normal takes'),
         ({'population': {'skin': {'normal': [0.0, 1.0]}}}, 'truncate it'),

@@ -42,7 +42,7 @@ def test_text_json_and_file_have_the_same_probabilities(
     ('words', 'message'),
     [
         (('--insertions', '-1'), '--insertions must be an integer from 0'),
-        (('--insertions', '10', '--radius', '0'), '--radius must be > 0 m'),
+        (('--insertions', '10', '--radius', '0'), '--radius must be finite, > 0 m'),
         (('--insertions', '10', '--seed', '-1'), '--seed must be an integer from 0'),
         (('--insertions', '10', '--population', 'none.yaml'), 'none.yaml cannot be read'),
         (('--population', 'none.yaml'), 'add --insertions'),
