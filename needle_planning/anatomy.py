@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import nan
 from typing import Final
@@ -18,6 +18,10 @@ ROLES: Final = ('obstacle', 'tissue', 'target', 'entry')
 
 #: Roles in the order in which structures cover each other.
 COVERS: Final = ('obstacle', 'target', 'entry', 'tissue')
+
+_ALONG: Final = 1e-4  #: Distance of the points outside of an entry point that are examined [m].
+#: Tissue outside of an entry point that is due to the size of the voxels, in voxels.
+_VOXELS: Final = 1.5
 
 #: Largest cosine between two axes of the voxels: 0.1 mm in 1 m; orientations in files are rounded.
 _PERPENDICULAR: Final = 1e-4
@@ -111,3 +115,53 @@ def beside(anatomies: Iterable[Anatomy], target: FloatArray) -> str:
         here |= {found.name} if found is not None else set()
     places = ' and '.join(sorted(here)) or 'no structure'
     return f'the target is not in {" or ".join(sorted(wanted))} (it is in {places})' * bool(wanted)
+
+
+def covered(anatomies: Iterable[Anatomy], entry: FloatArray, direction: FloatArray) -> str:
+    """
+    Return a line if a needle passes through structures before it is at its entry point.
+
+    Parameters
+    ----------
+    anatomies : iterable of Anatomy
+        Images in the same patient coordinates.
+    entry : ndarray, shape (3,)
+        Entry point in patient coordinates [m].
+    direction : ndarray, shape (3,)
+        Direction of the insertion, a unit vector.
+
+    Returns
+    -------
+    str
+        Names of the structures, and the length in them; empty for an entry point at the skin, to
+        the size of the voxels.
+
+    """
+    most, names = 0.0, dict[str, None]()
+    for anatomy in anatomies:
+        to_index = np.linalg.inv(anatomy.to_patient)
+        step = to_index[:3, :3] @ -direction
+        shape = np.array(anatomy.labels.shape)
+        first = to_index[:3, :3] @ entry + to_index[:3, 3]
+        # No point in the image is further away than all edges together and the first point.
+        far = (np.abs(first) + shape).sum() / np.linalg.norm(step)
+        index = np.rint(first + np.outer(np.arange(0.0, far, _ALONG), step)).astype(int)
+        index = index[((index >= 0) & (index < shape)).all(axis=1)]
+        found = anatomy.labels[tuple(index.T)]
+        inside = np.isin(found, list(anatomy.structures))
+        length = _ALONG * np.count_nonzero(inside)
+        if length * np.abs(step).max() > _VOXELS:
+            most = max(most, length)
+            names |= dict.fromkeys(anatomy.structures[one].name for one in found[inside].tolist())
+    through = ' and '.join(names)
+    return (
+        f'the needle passes through {through} for {1e3 * most:.1f} mm outside of the entry point'
+    ) * bool(names)
+
+
+def plan_warnings(
+    anatomies: Sequence[Anatomy], target: FloatArray, entry: FloatArray, direction: FloatArray
+) -> list[str]:
+    """Return the lines of `beside` and `covered` that are not empty."""
+    lines = beside(anatomies, target), covered(anatomies, entry, direction)
+    return [one for one in lines if one]

@@ -32,6 +32,7 @@ MOST_INSERTIONS: Final = 2**20  #: Most insertions.
 _WIDEST: Final = 6e-3  #: Largest entry error for which the tolerance is computed [m].
 _ENTRIES: Final = 1000  #: Most insertions for the tolerance.
 _KEPT: Final = 0.95  #: Probability of success within the tolerated entry error.
+_FEWEST: Final = 100  #: Fewest insertions for the causes of failure.
 _PART: Final = 16  #: Insertions between two reports of the progress.
 _RESAMPLED: Final = 400  #: Resamples for the interval of the tolerance.
 _LARGEST: Final = 2  #: Number of causes of failure.
@@ -132,6 +133,24 @@ class Chance(Displayed):
             (name, f'{100.0 * p:.1f} %', f'{100.0 * low:.1f} to {100.0 * high:.1f} %')
             for name, (p, low, high, _) in each.items()
         ]
+
+    def causes_text(self) -> str:
+        """Return the causes with their fractions and intervals in %, or why there are none."""
+        if self.insertions < _FEWEST:
+            return f'at least {_FEWEST} insertions are needed'
+        found = ', '.join(
+            '{} ({:.0f} %, {:.0f} to {:.0f} %)'.format(name, *(100.0 * np.array(one[:3])))
+            for name, one in self.causes
+        )
+        return found or 'none found'
+
+    def tolerance_text(self) -> str:
+        """Return the tolerance of the entry point with its interval [mm]."""
+        at_least = f'at least {1e3 * _WIDEST:g}'
+        value, low, high = (
+            f'{1e3 * one:.1f}' if one < _WIDEST else at_least for one in self.entry_tolerance[:3]
+        )
+        return f'{value} mm' if low == at_least else f'{value} mm ({low} to {high} mm)'
 
     def document(self) -> dict[str, Any]:
         """Return the result as numbers, in SI units, for files."""

@@ -125,6 +125,9 @@ def _labels(document: Any) -> Labels:
     if 'others' in document:
         others = len(structures) + 1
         structures[others] = _structure('others', 'others', document['others'])
+    count = Counter(one.name for one in structures.values())
+    if twice := [name for name, times in count.items() if times > 1]:
+        raise ParameterError(f'structures: {count[twice[0]]} of them have the name {twice[0]}')
     if not any(one.role == 'obstacle' for one in structures.values()):
         raise ParameterError('structures has no obstacle: without one, clearance is undefined')
     if 'space' in document:

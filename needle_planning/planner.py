@@ -434,6 +434,10 @@ def _region(
     names = sorted({one.name for anatomy in anatomies for one in anatomy.structures.values()})
     if isinstance(entry, str) and entry not in names:
         raise ParameterError(f'entry must be one of {", ".join(names)}, got {entry!r}')
+    every = (one for anatomy in anatomies for one in anatomy.structures.values())
+    role = next((one.role for one in every if one.name == entry), '')
+    if role in ('target', 'obstacle'):
+        raise ParameterError(f'entry: {entry} has the role {role}: no needle enters there')
     found = []
     for anatomy in anatomies:
         labels = [

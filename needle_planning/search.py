@@ -54,8 +54,10 @@ def voxel_region(anatomy: Anatomy, labels: list[int], target: FloatArray) -> Ent
     """
     Return the voxels with some labels, None without any.
 
-    Of a thick region only the side away from the target counts. Where a face of the image cuts
-    the region, no needle enters: there it is deeper along the normal of the face than it is wide.
+    Of a thick region only the side away from the target counts: voxels from which the needle
+    continues to an empty voxel or out of the image, or without any, out of the region. Where a
+    face of the image cuts the region, no needle enters: there it is deeper along the normal of the
+    face than it is wide.
     """
     inside = np.zeros_like(anatomy.labels, dtype=np.bool_)
     for label in labels:
@@ -75,12 +77,15 @@ def voxel_region(anatomy: Anatomy, labels: list[int], target: FloatArray) -> Ent
     following = index + np.round(np.divide(way, size, where=size > 0.0, out=way)).astype(int)
     shape = np.array(inside.shape)
     there = ((following >= 0) & (following < shape)).all(axis=1)
-    left = _left_through_cut_faces(inside, index, following, way, frame.spacing)
-    there[there] = inside[tuple(following[there].T)]
+    outside = ~_left_through_cut_faces(inside, index, following, way, frame.spacing)
+    within = following[there]
     # The voxel of the target would continue with itself.
-    there &= (following != index).any(axis=1)
+    outside[there] &= ~inside[tuple(within.T)] | (within == index[there]).all(axis=1)
+    skin = outside.copy()
+    skin[there] &= ~np.isin(anatomy.labels[tuple(within.T)], list(anatomy.structures))
     halves = (0.5 * frame.axes * frame.spacing).T
-    return EntryRegion(frame.to_patient(centers[~there & ~left]), halves, frame)
+    kept = skin if skin.any() else outside
+    return EntryRegion(frame.to_patient(centers[kept]), halves, frame)
 
 
 def _left_through_cut_faces(

@@ -37,8 +37,10 @@ def read_surfaces(paths: Sequence[Path], space: str, spacing: float) -> Iterator
     for path, triangles in zip(paths, surfaces, strict=True):
         inside = voxels_inside((triangles - matrix[:3, 3]) / spacing, shape)
         if not inside.any():
+            extent = float(np.ptp(triangles, axis=(0, 1)).max())
             raise SegmentationError(
-                f'{path.name} encloses no voxel of {spacing:g} m: reduce spacing'
+                f'{path.name} encloses no voxel of {1e3 * spacing:g} mm: its extent is '
+                f'{1e3 * extent:.3g} mm, read in mm as all STL files; reduce spacing, or scale it'
             )
         yield Layer(inside.view(np.uint8), matrix, {1: path.stem})
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from itertools import permutations
 from math import prod
-from typing import Final, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias, TypeVar
 
 from needle_dynamics import FloatArray
 from needle_planning.anatomy import check_axes, SegmentationError
@@ -19,6 +19,7 @@ Values: TypeAlias = NDArray[np.unsignedinteger]  #: values of voxels, 0 for the 
 #: Largest number of voxels of a file; all grids have twice as many. 1.4 GB are used at most.
 MOST_VOXELS: Final = 2**28
 LARGEST_VALUE: Final = 2**16 - 1  #: Largest value of a voxel.
+_ROUNDED: Final = 1e-3  #: Largest distance of a scaled value from a whole number.
 
 _CHUNK: Final = 2**20  #: Voxels that are converted at once.
 
@@ -70,10 +71,15 @@ def check_size(shape: tuple[int, ...]) -> None:
 def read_values(
     stream: Readable, shape: tuple[int, ...], dtype: np.dtype, slope: float, intercept: float
 ) -> Values:
-    """Read the values of all voxels, the first index fastest; they must be whole numbers."""
+    """
+    Read the values of all voxels, the first index fastest; they must be whole numbers.
+
+    Values that are scaled must be whole numbers to 0.001, and are rounded.
+    """
     check_size(shape)
     if dtype.kind not in 'iuf':
         raise SegmentationError(f'has voxels of type {dtype}, read are integers and floats')
+    scaled = (slope, intercept) != (1.0, 0.0)
     flat, size = np.empty(prod(shape), np.uint16), dtype.itemsize
     for start in range(0, flat.size, _CHUNK):
         part = flat[start : start + _CHUNK]
@@ -83,19 +89,27 @@ def read_values(
                 f'is truncated: it has {start * size + len(content)} of {flat.size * size} bytes'
             )
         read = np.frombuffer(content, dtype)
-        read = read if (slope, intercept) == (1.0, 0.0) else slope * read + intercept
+        if scaled:
+            given = slope * read + intercept
+            whole = np.rint(given)
+            read = np.where(np.abs(given - whole) <= _ROUNDED, whole, given)
         # NaN is not equal to itself.
         valid = (read >= 0) & (read <= LARGEST_VALUE)
         valid &= (read == np.rint(read)) if read.dtype.kind == 'f' else True
         if not valid.all():
             raise SegmentationError(
-                f'has the value {read[~valid][0]:g}: a segmentation has whole numbers from 0 to '
-                f'{LARGEST_VALUE}'
+                f'has the value {_digits(read[~valid][0])}: a segmentation has whole numbers '
+                f'from 0 to {LARGEST_VALUE}'
             )
         part[:] = read
     if stream.read(1):
         raise SegmentationError(f'has more than the {flat.size * size} bytes of its voxels')
     return flat.reshape(shape, order='F')
+
+
+def _digits(value: Any) -> str:
+    """Return a number with the digits that distinguish it from others of its type."""
+    return str(value).removesuffix('.0')
 
 
 def present(values: Values) -> list[int]:

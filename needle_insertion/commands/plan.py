@@ -12,11 +12,12 @@ from typing import Any, Final, TYPE_CHECKING
 
 from needle_controller.steering.insertion_plan import Plan, write_plan
 from needle_controller.steering.settings import SteeringLimits
-from needle_dynamics.needles import DEFAULT_NEEDLE
+from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle
+from needle_dynamics.steering.parameters import longest_insertion
 from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import table
-from needle_planning.anatomy import beside
+from needle_planning.anatomy import plan_warnings
 from needle_planning.paths import SKIN_LIMIT
 from needle_planning.planner import find_plan, RESOLUTION
 from needle_ros.errors import ParameterError
@@ -71,7 +72,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--entry-radius',
         'm',
         'radius of the disc of entry points around an entry point (default 10mm)',
-        0.01,
     )
     common.add_needle(parser, DEFAULT_NEEDLE)
     limits = SteeringLimits()
@@ -105,10 +105,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='uncertainty of these insertions, in the format of a study (default: documented)',
     )
     common.add_quantity(
-        parser, '--radius', 'm', 'largest distance of the tip from a hit target (default 1mm)',
-        1e-3,
-    )  # fmt: skip
-    parser.add_argument('--seed', type=int, default=1, help='seed of the insertions (default 1)')
+        parser, '--radius', 'm', 'largest distance of the tip from a hit target (default 1mm)'
+    )
+    parser.add_argument('--seed', type=int, help='seed of the insertions (default 1)')
     parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='plan to write (.yaml)')
     parser.add_argument(
         '--page',
@@ -128,9 +127,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    common.check_file(options.output)
-    common.check_file(options.page)
-    common.check_folder(options.slicer)
+    _check_outputs(options)
     target = _position('--target', options.target)
     limits = SteeringLimits(
         step_length=options.step,
@@ -138,6 +135,10 @@ def run(options: argparse.Namespace) -> int:
         guide_step=options.guide_step,
         load_limit=options.load_limit,
     )
+    needle = find_needle(options.needle)
+    reach = longest_insertion(needle.needle, needle.steering)
+    checked('--step', options.step, 'm', low=0.0, high=reach, open_low=True)
+    entry = _entry(options)
     simulate = _simulation(options)
     begin = perf_counter()
     with ProgressLine('plan', brief=True) as show:
@@ -149,8 +150,7 @@ def run(options: argparse.Namespace) -> int:
         plan = find_plan(
             anatomies,
             target,
-            entry=_entry(options.entry),
-            entry_radius=options.entry_radius,
+            **entry,
             needle=options.needle,
             limits=limits,
             roll=options.roll,
@@ -180,7 +180,7 @@ def run(options: argparse.Namespace) -> int:
 
         common.make_folder(options.slicer)
         files += write_slicer(plan, anatomies, options.slicer)
-    warnings = [one for one in [beside(anatomies, plan.target)] if one]
+    warnings = plan_warnings(anatomies, plan.target, plan.entry, plan.direction)
     common.print_each('warning', warnings)
     document, text = document_of(plan, seconds), text_of(plan, seconds)
     document['warnings'] = warnings
@@ -191,26 +191,46 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Raise `ParameterError` if an output has a wrong ending, or is an input or another one."""
+    inputs = *options.segmentation, options.labels, options.population, Path(options.needle)
+    taken = {path.expanduser().resolve() for path in inputs if path is not None}
+    for name, path, endings in (
+        ('--output', options.output, ('.yaml', '.yml')),
+        ('--page', options.page, ('.html', '.htm')),
+    ):
+        common.check_file(path)
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise ParameterError(f'{path} cannot be written: it is an input')
+        if path.suffix.lower() not in endings:
+            raise ParameterError(f'{name} must be a file {endings[0]}, got {path}')
+    common.check_folder(options.slicer)
+
+
 def _simulation(options: argparse.Namespace) -> Callable[..., Chance] | None:
     """Check the options of the simulated insertions; return the function, None for none."""
     if not options.insertions:
-        if options.population is not None:
-            raise ParameterError('--population is of simulated insertions: add --insertions 1000')
+        for name in ('population', 'radius', 'seed'):
+            if getattr(options, name) is not None:
+                raise ParameterError(f'--{name} is of simulated insertions: add --insertions 1000')
         return None
     # Imported here: Sobol sequences take half a second, and the output of studies is optional.
     from needle_planning.chance import chance_of, MOST_INSERTIONS, read_population
 
     check_whole('--insertions', options.insertions, 0, MOST_INSERTIONS)
-    check_whole('--seed', options.seed, 0, LARGEST_SEED)
-    checked('--radius', options.radius, 'm', low=0.0, open_low=True)
     given: dict[str, Any] = {}
+    if options.seed is not None:
+        check_whole('--seed', options.seed, 0, LARGEST_SEED)
+        given['seed'] = options.seed
+    if options.radius is not None:
+        given['radius'] = checked('--radius', options.radius, 'm', low=0.0, open_low=True)
     if options.population is not None:
         given['population'], given['correlations'] = read_population(options.population)
     return partial(
         chance_of,
         insertions=options.insertions,
-        seed=options.seed,
-        radius=options.radius,
         shafts=min(options.insertions, _SHOWN) if options.page is not None else 0,
         **given,
     )
@@ -220,9 +240,15 @@ def _position(name: str, text: str) -> list[float]:
     return point(text, f'{name} must be R,A,S, such as 40mm,-12mm,105mm')
 
 
-def _entry(text: str | None) -> str | list[float] | None:
-    """Return the name of a structure, or an entry point [m]."""
-    return text if text is None or ',' not in text else _position('--entry', text)
+def _entry(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments of `find_plan` for the name of a structure, or an entry point."""
+    text, radius = options.entry, options.entry_radius
+    if text is None or ',' not in text:
+        if radius is not None:
+            raise ParameterError('--entry-radius is of an entry point: add --entry R,A,S')
+        return {'entry': text}
+    point_of = {'entry': _position('--entry', text)}
+    return point_of if radius is None else {**point_of, 'entry_radius': radius}
 
 
 def document_of(plan: Plan, seconds: float) -> dict[str, Any]:
@@ -269,14 +295,9 @@ def text_of(plan: Plan, seconds: float) -> str:
 
 def chance_text(chance: Chance) -> str:
     """Return the results of simulated insertions as a table and text."""
-    causes = ', '.join(
-        f'{name} ({100.0 * one.value:.0f} %, {100.0 * one.low:.0f} to {100.0 * one.high:.0f} %)'
-        for name, one in chance.causes
-    )
-    tolerance = 1e3 * np.array(chance.entry_tolerance[:3])
     heads = f'{chance.insertions} insertions', 'probability', '95 % interval'
     return (
         f'{table(chance.rows(), heads)}\n\n'
-        f'largest causes of failure, fraction of its variance: {causes or "none found"}\n'
-        'tolerated error of the entry point: {:.1f} mm ({:.1f} to {:.1f} mm)'.format(*tolerance)
+        f'largest causes of failure, fraction of its variance: {chance.causes_text()}\n'
+        f'tolerated error of the entry point: {chance.tolerance_text()}'
     )

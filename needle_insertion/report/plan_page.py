@@ -25,7 +25,7 @@ from needle_insertion.report.section import (
     Section,
     section,
 )
-from needle_planning.anatomy import Anatomy, beside, ROLES
+from needle_planning.anatomy import Anatomy, plan_warnings, ROLES
 from needle_planning.chance import Chance
 from needle_planning.clearance import Clearance
 from needle_planning.planned_needle import complete_needle, shafts
@@ -101,7 +101,7 @@ def write_plan_page(
     ]
     near = f'to {plan.structure}' if plan.structure else 'to all obstacles'
     bent = plan.guide.any()
-    warning = beside(every, plan.target)
+    warnings = plan_warnings(every, plan.target, plan.entry, plan.direction)
     words = 'Drag to turn, or use the arrow keys. Obstacles are opaque, all else is translucent.'
     if chance is not None and len(shaft.inserted):
         words += f' Lines: {len(shaft.inserted)} of {chance.insertions} simulated insertions.'
@@ -113,7 +113,7 @@ def write_plan_page(
         introduction=f'Needle {plan.needle} from the skin to the target, '
         f'{"bowed by the guide" if bent else "straight"}, in {len(plan.guide)} steps. '
         'Clearances are beyond the margins of the obstacles.'
-        + (warning and f' Warning: {warning}.'),
+        + ''.join(f' Warning: {one}.' for one in warnings),
         cards=[
             ('Least clearance', f'{_mm(plan.clearance)} mm', near),
             ('Length', f'{_mm(plan.length)} mm', f'{len(plan.guide)} steps'),

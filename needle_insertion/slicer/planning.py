@@ -16,7 +16,7 @@ from needle_dynamics.needles import DEFAULT_NEEDLE, find_needle
 from needle_insertion.slicer.link import Frame
 from needle_insertion.slicer.needle import MILLIMETERS
 from needle_insertion.slicer.plan_files import planned_shape, PlannedShape
-from needle_planning.anatomy import Anatomy, beside
+from needle_planning.anatomy import Anatomy, plan_warnings
 from needle_planning.labels import anatomy_of, read_labels
 from needle_planning.planner import find_plan
 from needle_planning.voxels import Layer
@@ -55,7 +55,7 @@ class _Found(NamedTuple):
 
     plan: Plan
     shape: PlannedShape
-    warning: str  #: Line if the target is in no structure to reach, or empty.
+    warnings: list[str]  #: Lines of target and entry point.
 
 
 class SlicerPlanner:
@@ -160,7 +160,8 @@ class SlicerPlanner:
             # It raises an error after a cancellation.
             progress=lambda _: progress(0, 1),
         )
-        return _Found(plan, planned_shape(plan), beside(anatomies, at))
+        warnings = plan_warnings(anatomies, plan.target, plan.entry, plan.direction)
+        return _Found(plan, planned_shape(plan), warnings)
 
     def _end_reading(self, job: Job[Any]) -> None:
         try:
@@ -176,7 +177,7 @@ class SlicerPlanner:
     def _end_planning(self, job: Job[Any]) -> None:
         target = _words(self._target)
         try:
-            plan, self.shape, warning = job.result()
+            plan, self.shape, warnings = job.result()
             self._shown = True
         except (NeedleError, MemoryError) as error:
             line = self._failed(f'no plan for the {target}: {_reason(error)}')
@@ -188,9 +189,8 @@ class SlicerPlanner:
             f'plan for the {target}: {kind}, entry {_point(MILLIMETERS * plan.entry)} mm, '
             f'clearance {MILLIMETERS * plan.clearance:.2f} mm{near}'
         )
-        if warning:
-            line += f'; {warning}'
-        severity = Severity.WARNING if warning else Severity.INFO
+        line = '; '.join([line, *warnings])
+        severity = Severity.WARNING if warnings else Severity.INFO
         if self._settings.output:
             try:
                 write_plan(plan, self._settings.output)

@@ -225,6 +225,24 @@ def test_wider_obstacles_have_no_larger_clearance(tmp_path: Path, straight: Plan
     np.testing.assert_allclose(near - far, 5e-4, atol=5e-5)
 
 
+def test_tolerance_at_the_largest_examined_error_is_a_lower_bound(straight: Plan) -> None:
+    found = chance_of(straight, WIDE, insertions=8, population=NO_ERRORS, radius=0.05, workers=1)
+    assert found.entry_tolerance[:3] == (6e-3, 6e-3, 6e-3)
+    assert found.tolerance_text() == 'at least 6 mm'
+    for three, text in (
+        ((6e-3, 4.8e-3, 6e-3), 'at least 6 mm (4.8 to at least 6 mm)'),
+        ((5e-3, 4.8e-3, 5.12e-3), '5.0 mm (4.8 to 5.1 mm)'),
+    ):
+        estimate = found.entry_tolerance._replace(value=three[0], low=three[1], high=three[2])
+        assert replace(found, entry_tolerance=estimate).tolerance_text() == text
+
+
+def test_causes_need_100_insertions(straight: Plan) -> None:
+    found = chance_of(straight, WIDE, insertions=8, population=NO_ERRORS, workers=1)
+    assert found.causes_text() == 'at least 100 insertions are needed'
+    assert replace(found, insertions=100).causes_text() == 'none found'
+
+
 @settings(deadline=None)
 @given(st.lists(st.booleans(), min_size=2, max_size=80))
 def test_tolerance_is_where_the_isotonic_regression_ends(hits: Sequence[bool]) -> None:

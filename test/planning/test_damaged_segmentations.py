@@ -76,6 +76,7 @@ REJECTED: dict[str, tuple[Callable[[Path], Path], str]] = {
     'empty mask of nrrd': (lambda p: nrrd(p, 0 * VALUES), 'has no labeled voxel'),
     'intensities': (lambda p: nifti(p, VALUES - np.int16(1)), 'has the value -1: a segm'),
     'fractions': (lambda p: nifti(p, VALUES / np.float32(4)), r'has the value 0\.25: a segm'),
+    'almost whole': (lambda p: nifti(p, VALUES * (1.0 + 1e-6)), r'has the value 1\.000001: a s'),
     'not a number': (lambda p: nifti(p, VALUES * np.nan), 'has the value nan: a segmentation'),
     'large value': (lambda p: nrrd(p, 70000 * np.int32(VALUES)), 'has the value 70000: a segm'),
     'complex': (lambda p: nifti(p, VALUES * np.complex64(1)), 'has voxels of type complex64'),

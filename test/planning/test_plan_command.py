@@ -49,6 +49,34 @@ def test_target_beside_its_structure_is_a_warning(
     assert f'Warning: {line}.' in page.read_text(encoding='utf-8')
 
 
+def test_entry_point_below_the_skin_is_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / 'plan.html'
+    words = [*WORDS, '--target', TARGET, '--entry', '100mm,17mm,14mm', '--entry-radius', '1mm']
+    assert main([*words, '--straight', '--resolution', '2mm', '--page', str(page), '--json']) == 0
+    said = capsys.readouterr()
+    (line,) = json.loads(said.out)['warnings']
+    assert line.startswith('the needle passes through ')
+    assert said.err == f'warning: {line}\n'
+    assert f'Warning: {line}.' in page.read_text(encoding='utf-8')
+
+
+def test_input_is_not_an_output(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The files are as before, under any name."""
+    labels, image = tmp_path / 'labels.yaml', tmp_path / 'liver.seg.nrrd'
+    labels.write_bytes((LIVER / 'labels.yaml').read_bytes())
+    image.write_bytes((LIVER / 'liver.seg.nrrd').read_bytes())
+    link = tmp_path / 'plan.yaml'
+    link.symlink_to(labels)
+    words = ['plan', str(image), '--labels', str(labels), '--target', TARGET, '--straight']
+    for more in (['-o', str(labels)], ['-o', str(link)], ['-o', str(image)]):
+        assert main([*words, *more]) == 2
+        assert capsys.readouterr().err == f'error: {more[1]} cannot be written: it is an input\n'
+    assert labels.read_bytes() == (LIVER / 'labels.yaml').read_bytes()
+    assert image.read_bytes() == (LIVER / 'liver.seg.nrrd').read_bytes()
+
+
 def test_bound_holds_for_bows_that_are_not_searched(capsys: pytest.CaptureFixture[str]) -> None:
     """Of a guide that does not move, straight needles are the only ones."""
     found = []
@@ -79,6 +107,13 @@ def test_bound_holds_for_bows_that_are_not_searched(capsys: pytest.CaptureFixtur
         ((f'--target={TARGET}', '--skin-limit=-1mm'), 2, 'skin_limit must be >= 0 m'),
         ((f'--target={TARGET}', '-o', '/none/plan.yaml'), 2, 'its folder does not exist'),
         ((f'--target={TARGET}', '--page', '/none/plan.html'), 2, 'its folder does not exist'),
+        ((f'--target={TARGET}', '-o', 'p.txt'), 2, '--output must be a file .yaml, got p.txt'),
+        ((f'--target={TARGET}', '-o', 'p.html', '--page', 'p.html'), 2, 'must be a file .yaml'),
+        ((f'--target={TARGET}', '--page', 'p.txt'), 2, '--page must be a file .html, got p.txt'),
+        ((f'--target={TARGET}', '--entry', 'tumor'), 2, 'entry: tumor has the role target'),
+        ((f'--target={TARGET}', '--entry-radius', '3mm'), 2, 'add --entry R,A,S'),
+        ((f'--target={TARGET}', '--entry=entry', '--entry-radius=3mm'), 2, 'add --entry R,A,S'),
+        ((f'--target={TARGET}', '--step', '500mm'), 2, '--step must be finite, > 0 and <= 0.16'),
     ],
 )
 def test_invalid_request_is_one_line(

@@ -36,6 +36,7 @@ def test_text_json_and_file_have_the_same_probabilities(
     assert 'tip within 1 mm of the target' in text
     assert '16 insertions' in text
     assert 'tolerated error of the entry point' in text
+    assert 'fraction of its variance: at least 100 insertions are needed' in text
 
 
 @pytest.mark.parametrize(
@@ -46,6 +47,8 @@ def test_text_json_and_file_have_the_same_probabilities(
         (('--insertions', '10', '--seed', '-1'), '--seed must be an integer from 0'),
         (('--insertions', '10', '--population', 'none.yaml'), 'none.yaml cannot be read'),
         (('--population', 'none.yaml'), 'add --insertions'),
+        (('--radius', '-1mm'), '--radius is of simulated insertions: add --insertions'),
+        (('--seed', '1'), '--seed is of simulated insertions: add --insertions'),
     ],
 )
 def test_invalid_option_is_one_line(

@@ -292,3 +292,18 @@ def test_scaled_values_are_those_of_nibabel(tmp_path: Path) -> None:
 def test_invalid_anatomy_is_rejected(labels: np.ndarray, matrix: np.ndarray, reason: str) -> None:
     with pytest.raises(SegmentationError, match=reason):
         Anatomy(labels=labels, to_patient=matrix, structures={})
+
+
+@pytest.mark.parametrize('dtype', [np.int16, np.uint16])
+def test_scaled_values_are_rounded_to_whole_numbers(dtype: type, tmp_path: Path) -> None:
+    """Nibabel scales floats that are saved as integers: 1 is read as 1.00001, for example."""
+    image = nibabel.Nifti1Image(IMAGE.astype(np.float64), AFFINE)
+    image.set_data_dtype(dtype)
+    nibabel.save(image, tmp_path / 'a.nii.gz')
+    back = np.asanyarray(nibabel.load(tmp_path / 'a.nii.gz').dataobj)  # type: ignore[attr-defined]
+    assert not np.array_equal(back, IMAGE)
+    # Obstacle and tissue have the numbers 1 and 2.
+    found = read(tmp_path / 'a.nii.gz')
+    whole = nibabel.Nifti1Image(IMAGE, AFFINE)
+    nibabel.save(whole, tmp_path / 'b.nii.gz')
+    np.testing.assert_array_equal(found.labels, read(tmp_path / 'b.nii.gz').labels)

@@ -167,6 +167,8 @@ def test_space_in_the_header_of_slicer_is_used(tmp_path: Path) -> None:
         (trimesh.Trimesh(BOX.vertices, BOX.faces[1:]).export(file_type='stl'),
          'is not a closed surface'),
         (trimesh.creation.box(extents=[0.1] * 3).export(file_type='stl'), 'encloses no voxel'),
+        (trimesh.creation.box(extents=[0.02, 0.08, 0.02]).export(file_type='stl'),
+         'voxel of 1 mm: its extent is 0.08 mm, read in mm as all STL files; reduce spacing'),
         (trimesh.creation.box(extents=[1e5] * 3).export(file_type='stl'), 'voxels, at most'),
         (trimesh.creation.box(extents=[1e8] * 3).export(file_type='stl'), 'corners beyond 1 km'),
     ],

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Entry points are at the skin, or a line says how much tissue is outside of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from needle_planning import find_plan
+from needle_planning.anatomy import Anatomy, covered, plan_warnings, Structure
+from needle_planning.search import voxel_region
+from needle_ros.errors import ParameterError
+import numpy as np
+import pytest
+from support.anatomies import affine
+
+BODY, VEIN, TUMOR, PATCH = 1, 2, 3, 4
+TARGET = np.array([0.03, 0.03, 0.02])
+
+
+def body(below: int = 0, thick: int = 3) -> Anatomy:
+    """Return a body of voxels of 1 mm to z = 59.5 mm, and a patch so many voxels below its top."""
+    labels = np.zeros((60, 60, 70), dtype=np.int16)
+    labels[:, :, :60] = BODY
+    labels[40:44, :, 30:34] = VEIN
+    labels[29:32, 29:32, 19:22] = TUMOR
+    labels[10:30, 10:30, 60 - below - thick : 60 - below] = PATCH
+    return Anatomy(
+        labels=labels,
+        to_patient=affine([1e-3] * 3),
+        structures={
+            BODY: Structure(name='body', role='tissue'),
+            VEIN: Structure(name='vein', role='obstacle', margin=1e-3),
+            TUMOR: Structure(name='tumor', role='target'),
+            PATCH: Structure(name='patch', role='entry'),
+        },
+    )
+
+
+def warnings_of(anatomy: Anatomy) -> list[str]:
+    plan = find_plan(anatomy, TARGET, bow=False, resolution=1e-3)
+    return plan_warnings([anatomy], TARGET, plan.entry, plan.direction)
+
+
+@pytest.mark.parametrize('thick', [1, 3, 6])
+def test_thick_patch_in_the_skin_is_entered_at_the_skin(thick: int) -> None:
+    """Its sides in the tissue are no entry, and the part at the skin is complete."""
+    anatomy = body(thick=thick)
+    region = voxel_region(anatomy, [PATCH], TARGET)
+    assert region is not None
+    np.testing.assert_allclose(region.centers[:, 2], 0.059)
+    assert len(region.centers) == 20 * 20
+    assert warnings_of(anatomy) == []
+
+
+def test_patch_under_the_skin_is_entered_with_a_warning() -> None:
+    """Of a patch that nowhere borders on empty voxels, all sides count as before."""
+    anatomy = body(below=5)
+    region = voxel_region(anatomy, [PATCH], TARGET)
+    outside = voxel_region(
+        replace(anatomy, labels=np.where(anatomy.labels == PATCH, PATCH, 0)), [PATCH], TARGET
+    )
+    assert region is not None
+    assert outside is not None
+    np.testing.assert_array_equal(region.centers, outside.centers)
+    (line,) = warnings_of(anatomy)
+    assert line.startswith('the needle passes through ')
+    assert 'body for ' in line
+
+
+@pytest.mark.parametrize('depth', [0.004, 0.02])
+def test_tissue_outside_of_an_entry_point_is_measured(depth: float) -> None:
+    direction = np.array([0.6, 0.0, -0.8])
+    line = covered([body()], np.array([0.035, 0.05, 0.0595 - depth]), direction)
+    length = float(line.removesuffix(' mm outside of the entry point').rpartition(' ')[2])
+    assert length == pytest.approx(1e3 * depth / 0.8, abs=0.11)
+    assert line.startswith('the needle passes through body for ')
+
+
+def test_entry_point_within_the_size_of_the_voxels_is_at_the_skin() -> None:
+    for depth in (-0.01, 0.0, 0.001):
+        entry = np.array([0.05, 0.05, 0.0595 - depth])
+        assert covered([body()], entry, np.array([0.0, 0.0, -1.0])) == ''
+
+
+def test_obstacle_outside_of_an_entry_point_is_named() -> None:
+    """Clearance is of the needle from its entry point on: the line is the only hint."""
+    entry = np.array([0.042, 0.03, 0.025])
+    line = covered([body()], entry, np.array([0.0, 0.0, -1.0]))
+    assert line.startswith('the needle passes through body and vein for 34.5 mm')
+
+
+@pytest.mark.parametrize(('name', 'role'), [('tumor', 'target'), ('vein', 'obstacle')])
+def test_target_and_obstacle_are_no_entry(name: str, role: str) -> None:
+    with pytest.raises(ParameterError, match=f'entry: {name} has the role {role}: no needle'):
+        find_plan(body(), TARGET, entry=name)
