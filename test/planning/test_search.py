@@ -400,8 +400,8 @@ def cases() -> dict[str, tuple[dict[str, Any], str]]:
         'no number': ({'target': (np.nan, 0.0, 0.0)}, 'target must be finite, got nan'),
         'unknown entry': ({'entry': 'air'}, "entry must be one of bone, skin, got 'air'"),
         'entry at the target': ({'entry': TARGET}, 'further from the target'),
-        'disc': ({'entry': (0.0, 0.0, 0.1), 'entry_radius': -1.0}, 'entry_radius must be >= 0'),
-        'resolution': ({'resolution': 0.0}, 'resolution must be >= 0.0001 m, got 0.0'),
+        'disc': ({'entry': (0.0, 0.0, 0.1), 'entry_radius': -1.0}, 'entry_radius must be finite'),
+        'resolution': ({'resolution': 0.0}, 'resolution must be finite, >= 0.0001 m, got 0.0'),
         'skin': ({'skin_limit': np.nan}, 'skin_limit must be >= 0 m, got nan'),
         'needle': ({'needle': 'none'}, "needle must be one of .* got 'none'"),
     }  # fmt: skip
