@@ -300,7 +300,7 @@ def test_scaled_values_are_rounded_to_whole_numbers(dtype: type, tmp_path: Path)
     image = nibabel.Nifti1Image(IMAGE.astype(np.float64), AFFINE)
     image.set_data_dtype(dtype)
     nibabel.save(image, tmp_path / 'a.nii.gz')
-    back = np.asanyarray(nibabel.load(tmp_path / 'a.nii.gz').dataobj)  # type: ignore[attr-defined]
+    back = np.asanyarray(nibabel.load(tmp_path / 'a.nii.gz').dataobj)
     assert not np.array_equal(back, IMAGE)
     # Obstacle and tissue have the numbers 1 and 2.
     found = read(tmp_path / 'a.nii.gz')
