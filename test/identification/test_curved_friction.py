@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 import re
+from typing import Any
 
 from needle_dynamics import FloatArray
 from needle_identification import FrictionEstimate, FrictionSettings, identify_friction, Recording
@@ -66,7 +67,7 @@ def trapezoids(law: Law, seed: int, *, memory: float = 0.0, rounds: int = 1) -> 
     )
 
 
-def settings(*terms: str, **changes: float) -> FrictionSettings:
+def settings(*terms: str, **changes: Any) -> FrictionSettings:
     return FrictionSettings(terms=('coulomb', 'viscous', *terms), **changes)
 
 

@@ -390,8 +390,8 @@ def test_the_topic_that_is_left_is_that_of_the_sensor(tmp_path: Path) -> None:
             for time, row in zip(one.time, positions, strict=True):
                 stamp = 1_700_000_000_000_000_000 + round(1e9 * time)
                 bag.write(name, point.template().serialize(stamp, *row.tolist()), stamp)
-    for given in ({'truth_topic': '/robot_tip'}, {'tip_topic': '/aurora'}):
-        found = read_sensor_recording(path, path, **given)
+    for truth, tip in (('/robot_tip', None), (None, '/aurora')):
+        found = read_sensor_recording(path, path, truth_topic=truth, tip_topic=tip)
         np.testing.assert_allclose(found.tip, one.tip, rtol=1e-12)
         np.testing.assert_allclose(found.true_tip, one.true_tip, rtol=1e-12)
     with pytest.raises(RecordingError, match='must name one of /aurora, /robot_tip'):
