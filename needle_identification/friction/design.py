@@ -194,6 +194,18 @@ class Design:
             colored=True,
         )
 
+    def _fast_words(self) -> str:
+        """Words about an acceleration that leaves out a motion: by noise, counts or stick-slip."""
+        limit, moving = self.signals.settings.largest_acceleration, self.regime != 0.0
+        fast = np.abs(self.acceleration[moving]) > limit
+        if 'inertia' in self.signals.settings.terms or not (self.signals.is_clear and fast.any()):
+            return ''
+        return (
+            f'; {np.count_nonzero(moving) * self.signals.period:.3g} s of motion are not steady, '
+            f'with accelerations up to {np.abs(self.acceleration[moving]).max():.2g} m/s^2 '
+            f'(largest_acceleration {limit:g}): against noise and counts choose a lower cutoff'
+        )
+
     def check(self) -> None:
         signals = self.signals
         if not self.is_enough:
@@ -202,7 +214,7 @@ class Design:
                 f'steady motion above {signals.settings.moving_speed:g} m/s must last '
                 f'{needed:.3g} s in all, lasts '
                 f'{np.count_nonzero(self.used) * signals.period:.3g} s: move longer, or choose '
-                f'another axis, topic or column{signals.noise_remedy}'
+                f'another axis, topic or column{signals.noise_remedy or self._fast_words()}'
             )
         force = signals.force[self.used]
         if np.ptp(force) == 0.0:

@@ -78,10 +78,18 @@ class FilteredSignals:
     @property
     def noise_remedy(self) -> str:
         """Words about noise that hides much of the motion, which is more than noise; or none."""
-        speed = float(np.sqrt(np.mean(self.undelayed[0] ** 2)))
-        if not _SIGNAL * self.velocity_noise < speed < _HIDES * self.velocity_noise:
+        if not _SIGNAL * self.velocity_noise < self._speed < _HIDES * self.velocity_noise:
             return ''
         return f'; {self.noise_words}: choose a lower cutoff'
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether noise hides little of the motion."""
+        return self._speed >= _HIDES * self.velocity_noise
+
+    @property
+    def _speed(self) -> float:
+        return float(np.sqrt(np.mean(self.undelayed[0] ** 2)))
 
 
 def filter_signals(

@@ -388,6 +388,17 @@ def test_a_lower_cutoff_is_the_remedy_for_motion_hidden_by_noise(noise: float) -
             identify_friction(still)
 
 
+def test_a_lower_cutoff_is_the_remedy_for_coarse_counts() -> None:
+    """Counts of 0.1 mm at 250 Hz: the acceleration leaves out all samples."""
+    exact = strokes(seed=0, speeds=(0.02, 0.04, 0.06) * 3)
+    recording = replace(exact, depth=1e-4 * np.round(1e4 * exact.depth), velocity=None)
+    with pytest.raises(IdentificationError, match=r'not steady, .* choose a lower cutoff$'):
+        identify_friction(recording)
+    found = identify_friction(recording, FrictionSettings(cutoff=5.0))
+    # Equal strokes have equal errors of counting: no noise that an interval states.
+    assert found['viscous_friction'].value == pytest.approx(300.0, rel=1e-3)
+
+
 def test_noisy_velocities_are_replaced_by_differentiated_positions() -> None:
     recording, truth = recorded(NoiseKind(speed_noise=1e-3), np.random.default_rng(3))
     found = identify_friction(recording)
