@@ -26,6 +26,8 @@ LARGEST_LATENCY: Final = 0.25
 
 _NOTABLE_LATENCY: Final = 0.05  # smallest difference of latencies that is reported [s]
 _CERTAINTY: Final = 3.0  # smallest clock offset, as a multiple of the variation of the latencies
+_NOTABLE_DRIFT: Final = 2e-3  # smallest drift of clocks that is reported [s]
+_PARTS, _FEW = 5, 20  # of the latencies, of which the first and last are compared; fewest in each
 
 
 def merged_recording(
@@ -86,14 +88,31 @@ def clock_offset(force: Samples, motion: Samples) -> tuple[int, str]:
     (force_low, force_mid), (motion_low, motion_mid) = quantiles
     offset = int(motion_low - force_low)
     variation = _CERTAINTY * (float(force_mid - force_low) + float(motion_mid - motion_low))
+    drifts = _drift(force, motion)
     words = f'by the receive times {force.topic} is stamped {offset * 1e-9:.3f} s after '
     if abs(offset) > max(1e9 * LARGEST_LATENCY, variation):
-        return offset, f'{words}{motion.topic}: clocks differ, corrected'
+        return offset, '; '.join([f'{words}{motion.topic}: clocks differ, corrected', *drifts])
     if abs(offset) > max(1e9 * _NOTABLE_LATENCY, variation):
         return 0, (
             f'{words}{motion.topic}: may be latency, not corrected; time receive would correct it'
         )
-    return 0, ''
+    return 0, ''.join(drifts)
+
+
+def _drift(force: Samples, motion: Samples) -> list[str]:
+    """Return a loss if the clock of the force runs faster or slower than that of the motion."""
+    growth = variation = 0.0
+    for sign, samples in ((-1.0, force), (1.0, motion)):
+        first, *_, last = np.array_split(samples.latency, _PARTS)
+        if len(last) < _FEW:
+            return []
+        low, mid = np.transpose([np.quantile(one, (0.05, 0.5)) for one in (first, last)])
+        growth += sign * float(low[1] - low[0])
+        variation += float((mid - low).sum())
+    if abs(growth) < max(1e9 * _NOTABLE_DRIFT, _CERTAINTY * variation):
+        return []
+    words = f'by the receive times the clock of {force.topic} gains {1e-6 * growth:.1f} ms on that'
+    return [f'{words} of {motion.topic}, not corrected; time receive would correct it']
 
 
 def _covered(stamps: IntArray, motion: IntArray) -> BoolArray:

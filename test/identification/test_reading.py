@@ -4,6 +4,7 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+import re
 import struct
 from typing import Any
 
@@ -17,6 +18,8 @@ from needle_identification import (
     RecordingError,
 )
 from needle_identification.bags.messages import message_type
+from needle_identification.recordings.merging import clock_offset
+from needle_identification.recordings.samples import Samples
 from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -569,6 +572,36 @@ def test_the_joint_out_of_the_plane_may_be_missing(tmp_path: Path) -> None:
     )
     with pytest.raises(RecordingError, match='must have the joints y and z, has x, z'):
         read_indentation_recording(path, axes=('y', 'z'))
+
+
+@given(
+    strategies.sampled_from(
+        [(-1e-3, 0.0), (-2e-4, 0.0), (0.0, 0.0), (2e-5, 0.0), (2e-4, 0.0), (1e-3, 0.0), (0.0, 0.5)]
+    ),
+    strategies.integers(0, 99),
+)
+def test_a_drift_of_clocks_is_reported(rates: tuple[float, float], seed: int) -> None:
+    """Beside latencies of 0.1 ms; a drift of both stamps, as of simulated time, is none."""
+    (rate, common), rng = rates, np.random.default_rng(seed)
+    time = np.arange(0.0, 50.0, 0.01)
+    force, motion = (
+        Samples(
+            name,
+            (1e9 * time).astype(np.int64),
+            np.zeros((len(time), 1)),
+            (1e9 * (rng.exponential(1e-4, len(time)) - own * time)).astype(np.int64),
+        )
+        for name, own in (('/force', rate + common), ('/motion', common))
+    )
+    offset, loss = clock_offset(force, motion)
+    assert offset == 0
+    if abs(rate) * 50.0 < 2e-3:
+        assert loss == ''
+    else:
+        # From the first to the last fifth, within a fifth; 0.1 ms is the error of the latencies.
+        gained = float(re.findall(r'gains (\S+) ms', loss)[0])
+        assert gained == pytest.approx(4e4 * rate, abs=0.1 + 1e4 * abs(rate))
+        assert loss.endswith('time receive would correct it')
 
 
 @pytest.mark.parametrize('axes', [('x', 'x'), ('x', '-x'), ('x', 'w')])
