@@ -62,7 +62,7 @@ def test_json_contains_the_summary(capsys: pytest.CaptureFixture[str]) -> None:
         (['--depth', '0.3'], 'insertion depth 0.3 m is outside'),
         (['--interval', '0'], 'interval and duration must be positive'),
         (['-o', 'run.xlsx'], 'output must be .csv, .png or a folder'),
-        (['--tolerance', '-1'], 'tolerance must be positive'),
+        (['--tolerance', '-1'], 'tolerance must be finite, > 0'),
     ],
 )
 def test_invalid_input_is_a_one_line_error(

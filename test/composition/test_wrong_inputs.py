@@ -78,7 +78,7 @@ ANSWERS = {
     'watch BAG --control': 'omit --control or the BAG',
     'watch BAG --time stamp': "(choose from 'header', 'receive')",
     'study nowhere.yaml': 'nowhere.yaml cannot be read: No such file',
-    'study typo.yaml': 'valid: correlations, design, files, population',
+    'study typo.yaml': 'valid: correlations, design, population',
     'study study.yaml --workers 0': '--workers must be >= 1',
     'study study.yaml --replay 99': '--replay must be from 0 to 9',
     'verify nowhere': 'nowhere does not exist; valid: a rosbag2 folder',
