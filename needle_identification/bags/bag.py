@@ -88,9 +88,8 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
     if names is None:
         by_time = not (path / METADATA).exists()
         if len(recordings_among(chosen, by_time=by_time)) > 1:
-            raise RecordingError(
-                f'{path} holds several recordings; name them, such as {chosen[0]}'
-            )
+            several = f'{path} holds several recordings; name them, such as {chosen[0]}'
+            raise RecordingError('; '.join([several, *([] if by_time else losses)]))
         return chosen, losses
     there = {file.name for file in chosen}
     losses = [f'the recorder lost {lost}'] if lost else []

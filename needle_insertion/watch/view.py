@@ -10,7 +10,7 @@ from needle_dynamics import FloatArray
 from needle_ros import contract
 from needle_ros.quantities import NORMAL
 from needle_ros.settings import is_number
-from needle_ros.status import ControllerStatus, NodeReport, SILENT, SteeringStatus
+from needle_ros.status import ControllerStatus, NodeReport, SteeringStatus
 from needle_ros.wire import Reading
 import numpy as np
 
@@ -28,6 +28,7 @@ _LIMITS: Final = {
 
 RATE: Final = 30.0  #: frames per second
 SPAN: Final = 20.0  #: duration of the history [s]
+_SILENT_NODE: Final = 3.0  #: timeout of the status of a node, which is published every second [s]
 
 #: Largest number of points of a line, and of nodes.
 _POINTS: Final = 120
@@ -323,7 +324,7 @@ class View:
                     'level': report.level,
                     'words': report.message,
                     'age': round(age, 1),
-                    'silent': age > SILENT,
+                    'silent': age > _SILENT_NODE,
                     'last_rejection': getattr(typed, 'last_rejection', ''),
                 }
             )
