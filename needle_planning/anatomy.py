@@ -20,7 +20,7 @@ ROLES: Final = ('obstacle', 'tissue', 'target', 'entry')
 COVERS: Final = ('obstacle', 'target', 'entry', 'tissue')
 
 _ALONG: Final = 1e-4  #: Distance of the points outside of an entry point that are examined [m].
-#: Tissue outside of an entry point that is due to the size of the voxels, in voxels.
+#: Largest tissue outside of an entry point at the skin, by the size of the voxels [voxels].
 _VOXELS: Final = 1.5
 
 #: Largest cosine between two axes of the voxels: 0.1 mm in 1 m; orientations in files are rounded.
@@ -119,7 +119,7 @@ def beside(anatomies: Iterable[Anatomy], target: FloatArray) -> str:
 
 def covered(anatomies: Iterable[Anatomy], entry: FloatArray, direction: FloatArray) -> str:
     """
-    Return a line if a needle passes through structures before it is at its entry point.
+    Return a warning of structures outside of an entry point, on the line of the needle.
 
     Parameters
     ----------

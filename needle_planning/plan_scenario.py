@@ -14,7 +14,6 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import ceil, cos, hypot, pi, sin
 from pathlib import Path
-import re
 from typing import Any, Final, NamedTuple
 
 from needle_controller.steering.contact import monitored
@@ -64,6 +63,7 @@ from needle_planning.certificate import least_clearances, sag_of, simulate_inser
 from needle_planning.clearance import Clearance, image_frame
 from needle_planning.labels import read_anatomy, read_labels
 from needle_planning.paths import Line, needle_radius
+from needle_planning.segmentation import source_files
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
 from needle_study import scenario
@@ -82,9 +82,6 @@ _BEYOND: Final = 0.02  #: Distance from the line within which the clearance is e
 _SAME: Final = _TIGHT + 2e-6
 _ROUNDED: Final = 1e-3  #: Tolerance of an index of a voxel.
 _SAME_RADIUS: Final = 1e-7  #: Largest difference of the radius of the same needle [m].
-_NRRD: Final = ('.nrrd', '.nhdr')
-#: Field of a header of NRRD whose data are in another file.
-_DATA_FILE: Final = re.compile(rb'(?im)^data ?file *: *([^\r\n]*[^\r\n ])')
 _FILES: Final = ('plan', 'segmentation', 'labels')
 _PARTS: Final = ('folder', 'law', 'prior', 'contact', *_FILES)
 
@@ -140,19 +137,6 @@ class _Numbers(SteeringLimits):
     radius: float = constant(
         1e-3, 'm', 'largest distance of the tip from a hit target', open_low=True
     )
-
-
-def _files_of(name: str) -> list[Path]:
-    """Return the files that are read for a name: of a folder all, of NRRD also the data file."""
-    path = Path(name).expanduser()
-    if path.is_dir():
-        return sorted(one for one in path.iterdir() if one.is_file())
-    if not (path.is_file() and name.lower().endswith(_NRRD)):
-        return [path]
-    header, *_ = re.split(rb'\r?\n\r?\n', path.read_bytes(), maxsplit=1)
-    found = _DATA_FILE.search(header)
-    beside = path.parent / found[1].decode(errors='replace') if found else path
-    return [path, beside] if found and beside.is_file() else [path]
 
 
 class _Inputs(NamedTuple):
@@ -302,7 +286,10 @@ class PlanScenario(Scenario):
         self._plan = read_plan(settings['plan'])
         read_labels(settings['labels'])
         self.files = {
-            **{name: scenario.checksum(name, _files_of(name)) for name in files},
+            **{
+                name: scenario.checksum(name, source_files(Path(name).expanduser()))
+                for name in files
+            },
             **scenario.needle_files(self._plan.needle),
         }
         return Path(settings['plan']), images, settings['labels']

@@ -31,7 +31,8 @@ from needle_ros.errors import missing_extra
 import numpy as np
 
 #: Endings of the names of files that are read.
-ENDINGS: Final = ('.nrrd', '.nhdr', '.nii', '.nii.gz', '.stl')
+_NRRD: Final = ('.nrrd', '.nhdr')
+ENDINGS: Final = (*_NRRD, '.nii', '.nii.gz', '.stl')
 
 _LONGEST: Final = 2**22  #: Largest header of NRRD [byte].
 
@@ -118,6 +119,20 @@ def read_layers(path: Path, space: str = '', spacing: float = 1e-3) -> Iterator[
         raise SegmentationError(f'{path}: exceeds the memory') from error
 
 
+def source_files(path: Path) -> list[Path]:
+    """Return all files of a segmentation: of a folder each, of NRRD also the data file."""
+    if path.is_dir():
+        return sorted(one for one in path.iterdir() if one.is_file())
+    if not (path.is_file() and path.name.lower().endswith(_NRRD)):
+        return [path]
+    try:
+        with path.open('rb') as stream:
+            beside = _data_file(path, _nrrd_header(path, stream))
+    except SegmentationError as error:
+        raise SegmentationError(f'{path}: {error}') from error
+    return [path, beside] if beside else [path]
+
+
 def _layers(path: Path, space: str, spacing: float) -> Iterator[Layer]:
     name = path.name.lower()
     if path.is_dir():
@@ -132,7 +147,7 @@ def _layers(path: Path, space: str, spacing: float) -> Iterator[Layer]:
         yield from read_surfaces([path], space, spacing)
         return
     with ExitStack() as stack:
-        read = _nrrd if name.endswith(('.nrrd', '.nhdr')) else _nifti
+        read = _nrrd if name.endswith(_NRRD) else _nifti
         values, matrix, segments = read(path, stack, space)
     stem = path.name[: -len(next(end for end in reversed(ENDINGS) if name.endswith(end)))]
     stem = stem.removesuffix('.seg')
@@ -160,10 +175,7 @@ def _nrrd(path: Path, stack: ExitStack, space: str) -> tuple[Values, FloatArray,
     if header.get('line skip', header.get('lineskip', 0)):
         raise SegmentationError('has a line skip, which is not read')
     skip = header.get('byte skip', header.get('byteskip', 0))
-    if file := header.get('data file', header.get('datafile')):
-        beside = (path.parent / file).resolve()
-        if not (beside.is_relative_to(path.parent.resolve()) and beside.is_file()):
-            raise SegmentationError(f'has the data file {file}, which is not a file beside it')
+    if beside := _data_file(path, header):
         stream = stack.enter_context(beside.open('rb'))
     if skip == -1 and header['encoding'] == 'raw':
         stream.seek(max(stream.seek(0, 2) - prod(shape) * kind.itemsize, 0))
@@ -180,6 +192,17 @@ def _nrrd(path: Path, stack: ExitStack, space: str) -> tuple[Values, FloatArray,
         )
     values = read_values(data, shape, kind, 1.0, 0.0)
     return values if is_list else values[None], matrix, segments
+
+
+def _data_file(path: Path, header: Mapping[str, Any]) -> Path | None:
+    """Return the file of the voxels if it is not the file of the header."""
+    file = header.get('data file', header.get('datafile'))
+    if not file:
+        return None
+    beside = (path.parent / str(file)).resolve()
+    if not (beside.is_relative_to(path.parent.resolve()) and beside.is_file()):
+        raise SegmentationError(f'has the data file {file}, which is not a file beside it')
+    return beside
 
 
 def _nrrd_header(path: Path, stream: BinaryIO) -> dict[str, Any]:

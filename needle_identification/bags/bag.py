@@ -124,7 +124,7 @@ def _in_order(files: Iterable[Path]) -> list[Path]:
 
 
 def _continue(parts: Sequence[Path]) -> bool:
-    """Whether each file begins when the one before ends, as far as their times are readable."""
+    """Return whether each file begins at the end of the previous one, if times are readable."""
     return all(
         not before or not after or abs(after[0] - before[1]) < _PAUSE
         for before, after in pairwise(map(_span, parts))
