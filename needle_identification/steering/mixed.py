@@ -26,12 +26,12 @@ References
 """
 
 from collections.abc import Sequence
+from copy import copy
 from itertools import product
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray
 import numpy as np
-from scipy.special import logsumexp
 
 _REACH: Final = 0.1  # depth at which path noise and slopes have the deviations of the grid [m]
 _TRAVEL: Final = 1e-3  # motion of the guide whose response has the deviation of the grid [m]
@@ -95,35 +95,47 @@ class MixedModel:
                 half, log = known[depth.tobytes()]
                 self._half[k, i, : len(half), : len(half)] = half
                 self._logs[k] += 2.0 * log
+        # Whitened columns and tips of all recordings in both planes; each constant of the drift
+        # has a reading of 0, the prior.
+        c, count = len(prior), 2 * rows * len(depths)
+        self._rows = np.zeros((len(ratios), count + c, c + 1))
+        self._rows[:, count + np.arange(c), range(c)] = prior
+
+    def limited(self, kept: BoolArray) -> 'MixedModel':
+        """Return the model with some of the ratios (K,)."""
+        found = copy(self)
+        found.ratios, found._half, found._logs, found._rows = (
+            one[kept] for one in (self.ratios, self._half, self._logs, self._rows)
+        )
+        return found
 
     def likelihood(
         self, columns: Sequence[FloatArray], wanted: Sequence[FloatArray]
     ) -> Likelihood:
         """Fit the drift, (2, n, c) for each recording, to what the guide leaves, (2, n) [m]."""
-        c = columns[0].shape[-1]
-        both = np.zeros((len(wanted), self._half.shape[-1], 2, c + 1))
+        c, recordings, most = len(self.prior), *self._half.shape[1:3]
+        both = np.zeros((recordings, most, 2, c + 1))
         for at, column, one in zip(both, columns, wanted, strict=True):
             n = one.shape[1]
             at[:n, :, :c], at[:n, :, c] = np.swapaxes(column, 0, 1), one.T
         # One product for both planes.
-        planes = both.reshape(*both.shape[:2], -1)
-        rows = (self._half @ planes).reshape(len(self._half), -1, c + 1)
-        # The prior is a reading of 0 of each constant.
-        prior = np.zeros((len(rows), c, c + 1))
-        prior[:, range(c), range(c)] = self.prior
-        rows = np.concatenate([rows, prior], axis=1)
-        design, tips = rows[..., :c], rows[..., c]
-        normal = np.swapaxes(design, 1, 2) @ design
+        planes = both.reshape(recordings, most, -1)
+        rows = self._rows
+        whitened = rows[:, :-c].reshape(len(rows), *planes.shape)
+        np.matmul(self._half, planes, out=whitened)
+        # Products of all columns: those of slices are several times slower.
+        products = np.swapaxes(rows, 1, 2) @ rows
+        normal = products[:, :c, :c]
         inverse = np.linalg.inv(normal)
-        values = (inverse @ np.swapaxes(design, 1, 2) @ tips[..., np.newaxis])[..., 0]
-        left = tips - (design @ values[..., np.newaxis])[..., 0]
+        values = np.einsum('kij,kj->ki', inverse, products[:, :c, c])
+        left = (rows @ np.insert(-values, c, 1.0, axis=1)[..., np.newaxis])[..., 0]
         variances = np.einsum('kn,kn->k', left, left) / self.freedom + _FINEST**2
         each = self.freedom * np.log(variances) + self._logs + np.linalg.slogdet(normal)[1]
-        total = logsumexp(-0.5 * each)
+        total = float(np.logaddexp.reduce(-0.5 * each))
         weights = np.exp(-0.5 * each - total)
         unknown = np.diagonal(inverse, axis1=1, axis2=2) @ self.prior**2
         return Likelihood(
-            deviance=-2.0 * float(total),
+            deviance=-2.0 * total,
             weights=weights,
             variances=variances,
             values=values,

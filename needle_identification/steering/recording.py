@@ -275,8 +275,8 @@ class SimulatedCauses:
         return TipResponses(guide=guide, tilt=tilt[:, 1], bevel=bevel)
 
 
-def drift(term: str, recording: SteeringRecording, r: TipResponses) -> FloatArray:
-    """Return tip motion in x, then z, per unit of the constants of a term, shape (2 n, k)."""
+def drift(terms: Sequence[str], recording: SteeringRecording, r: TipResponses) -> FloatArray:
+    """Return the tip motion in x and z per unit of each constant of the terms, (2, n, c)."""
     zero, depth = np.zeros(len(r.tilt)), recording.depth
     (guide_x, guide_z), (bevel_x, bevel_z) = r.guide.T, r.bevel.T
     pairs = {
@@ -285,5 +285,5 @@ def drift(term: str, recording: SteeringRecording, r: TipResponses) -> FloatArra
         'frame': [(depth, zero), (zero, depth), (guide_z, -guide_x)],
         # Load along z at zero roll, and rotated by a quarter turn.
         'bevel': [(bevel_x, bevel_z), (bevel_z, -bevel_x)],
-    }[term]
-    return np.array([np.concatenate(pair) for pair in pairs]).T
+    }
+    return np.array([pair for term in terms for pair in pairs[term]]).transpose(1, 2, 0)

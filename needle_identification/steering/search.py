@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Search for the lengths with the highest likelihood, their intervals, and predictions."""
 
-from collections.abc import Iterator, Sequence
-from functools import lru_cache, partial
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from math import copysign, exp, inf, log, sqrt
 from typing import Final, NamedTuple
 
@@ -42,8 +42,8 @@ _SKINS: Final = (0.0, 0.006, 0.02, 0.08, 0.5)
 _ROUNDS: Final = 12  # largest number of rounds of a search
 _SETTLED: Final = 1e-3  # gain of the deviance in the last round
 _STEP: Final = 1e-4  # step of a derivative
-_ROLLED: Final = 0.1  # roll that excites the bevel [rad]
 _NOTHING: Final = 1e-4  # weight of a ratio without effect on a search
+_ROLLED: Final = 0.1  # roll that excites the bevel [rad]
 _APART: Final = 0.05  # least difference between the variables of different optima
 _NEAR: Final = 0.02  # relative tolerance of the ends of intervals
 
@@ -60,8 +60,10 @@ class Tips:
         self, recordings: Sequence[SteeringRecording], order: str, layers: NominalLayers = UNIFORM
     ) -> None:
         self.recordings, self.order, self.layers = recordings, order, layers
-        self.moved = [np.column_stack([one.depth, one.guide])[one.known] for one in recordings]
-        self.measured = [one.tip[one.known].T for one in recordings]  # (2, n) [m]
+        self.known = [one.known for one in recordings]
+        pairs = list(zip(recordings, self.known, strict=True))
+        self.moved = [np.column_stack([one.depth, one.guide])[known] for one, known in pairs]
+        self.measured = [one.tip[known].T for one, known in pairs]  # (2, n) [m]
         self._insertions = [SimulatedCauses(one, order, layers.starts) for one in recordings]
         self.of = lru_cache(maxsize=8000)(self._responses)
 
@@ -161,11 +163,9 @@ class Search:
 
     def design(self, at: int, *lengths: float) -> tuple[FloatArray, FloatArray]:
         """Return the response to the guide (2, n), and to the drift constants (2, n, c)."""
-        one = self.tips.recordings[at]
+        one, known = self.tips.recordings[at], self.tips.known[at]
         r = self.tips.of(at, *lengths)
-        columns = np.hstack([drift(term, one, r) for term in self.terms])
-        columns = columns.reshape(2, len(one.depth), -1)
-        return r.guide[one.known].T, columns[:, one.known]
+        return r.guide[known].T, drift(self.terms, one, r)[:, known]
 
     def fits(self, x: FloatArray) -> list[Likelihood]:
         return [self._part(k, *own) for k, own in enumerate(self.lengths(x))]
@@ -190,9 +190,13 @@ class Search:
         now, jacobian = self.deviance(x), np.zeros((1, len(at)))
         for _ in range(_ROUNDS if at else 0):
             trial = x.copy()
-            residual = partial(self._residual, self._weights(x), trial, at)
             found = least_squares(
-                residual, x[at], bounds=(low[at], high[at]), x_scale='jac', max_nfev=6
+                self._residual(x, at),
+                x[at],
+                bounds=(low[at], high[at]),
+                x_scale='jac',
+                max_nfev=6,
+                ftol=1e-5,
             )
             trial[at] = found.x
             gain, jacobian = now - self.deviance(trial), found.jac
@@ -277,18 +281,21 @@ class Search:
                 found[at] = left.T - left.mean(axis=1)
         return [found[at] for at in sorted(found)]
 
-    def _weights(self, x: FloatArray) -> list[FloatArray]:
-        """Return the factors (K, 1) of the residuals of each medium for least squares near x."""
+    def _residual(self, x: FloatArray, at: list[int]) -> Callable[[FloatArray], FloatArray]:
+        """Return the residuals for least squares near x by the variables with these indices."""
         each = [(one, one.weights > _NOTHING) for one in self.fits(x)]
-        return [np.sqrt(one.weights * kept / one.variances)[:, np.newaxis] for one, kept in each]
+        factors = [np.sqrt(one.weights / one.variances)[kept, np.newaxis] for one, kept in each]
+        models = [m.limited(kept) for m, (_, kept) in zip(self.models, each, strict=True)]
+        near, there = Search(self.tips, self.terms, self.known, models), x.copy()
 
-    def _residual(
-        self, factors: list[FloatArray], x: FloatArray, at: list[int], values: FloatArray
-    ) -> FloatArray:
-        x[at] = values
-        parts = zip(factors, self.fits(x), strict=True)
-        found = [(own * one.residuals)[own[:, 0] > 0.0].ravel() for own, one in parts]
-        return np.concatenate([*found, self.apart(x)])
+        def residual(values: FloatArray) -> FloatArray:
+            there[at] = values
+            parts = zip(factors, near.fits(there), strict=True)
+            return np.concatenate(
+                [*((own * one.residuals).ravel() for own, one in parts), self.apart(there)]
+            )
+
+        return residual
 
     def optima(self, near: Sequence[FloatArray] = ()) -> list[Optimum]:
         """Return distinct optima, the best first; from a grid without near points."""

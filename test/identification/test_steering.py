@@ -153,6 +153,21 @@ def test_likelihood_is_that_of_the_joint_normal_distribution() -> None:
     assert_allclose(differences, differences[0], atol=1e-4)
 
 
+def test_a_limited_model_has_the_fits_of_its_ratios() -> None:
+    rng = np.random.default_rng(1)
+    moved = [np.column_stack([np.linspace(0.0, 0.1, n), np.zeros((n, 2))]) for n in (9, 12)]
+    model = MixedModel(moved, np.array([2e-3, 5e-3, 0.1]))
+    columns = [rng.normal(0.0, 0.02, (2, len(one), 3)) for one in moved]
+    tips = [rng.normal(0.0, 1e-3, (2, len(one))) for one in moved]
+    kept = rng.random(len(model.ratios)) < 0.2
+    whole = model.likelihood(columns, tips)
+    part = model.limited(kept).likelihood(columns, tips)
+    for name in ('variances', 'values', 'covariances', 'residuals'):
+        # Rounding only.
+        assert_allclose(getattr(part, name), getattr(whole, name)[kept], rtol=1e-9, atol=1e-15)
+    assert_allclose(part.weights, whole.weights[kept] / whole.weights[kept].sum(), rtol=1e-9)
+
+
 @pytest.mark.parametrize('first', [False, True])
 def test_the_order_of_guide_and_needle_is_detected(first: bool) -> None:
     found = identify_steering(
