@@ -240,8 +240,12 @@ def chance_of(
     check_whole('shafts', shafts, 0, insertions)
     checked('radius', radius, 'm', low=0.0, open_low=True)
     # Imported here: it imports Numba.
-    from needle_planning.plan_scenario import write_inputs
+    from needle_planning.plan_scenario import absent_layers, write_inputs
 
+    given = dict(_population(plan) if population is None else population)
+    for name, reason in absent_layers(len(plan.layers)).items():
+        if name in given:
+            raise ParameterError(f'population: {name} {reason}')
     with TemporaryDirectory(prefix='needle-plan-') as folder:
         write_inputs(Path(folder), plan, [anatomy] if isinstance(anatomy, Anatomy) else anatomy)
         settings = {
@@ -253,7 +257,6 @@ def chance_of(
             'prior': asdict(prior or SteeringPrior()),
         }
         document = {'scenario': _SCENARIO, 'seed': seed, 'settings': settings}
-        given = dict(_population(plan) if population is None else population)
         studies = _studies(document, insertions, given, list(correlations))
         values, by_entry, by_cause = _simulated(studies, Path(folder), count, progress)
         kept = _shafts(studies[0], shafts)

@@ -158,6 +158,11 @@ def _holds(anatomy: Anatomy, point: FloatArray) -> bool:
     return bool((index >= -0.5 - _ROUNDED).all() and (index <= ends + _ROUNDED).all())
 
 
+def absent_layers(count: int) -> dict[str, str]:
+    """Return the reason for each variable of a layer that a plan with fewer layers has not."""
+    return dict.fromkeys(LAYERS[count:], f'is not in the plan, which has {count} layers')
+
+
 def _check(plan: Plan, inputs: _Inputs, limits: SteeringLimits) -> None:
     """Raise `ParameterError` if a plan is not of these inputs and limits."""
     # A straight needle in open loop needs no guide.
@@ -215,9 +220,8 @@ class PlanScenario(Scenario):
         self._contact = from_values(
             ContactSettings, {'limit': 1.0, **contact}, 'settings.contact.'
         )
-        layers = LAYERS if self._plan is None else LAYERS[: len(self._plan.layers)]
-        self.absent = dict.fromkeys(LAYERS, f'is not in the plan, which has {len(layers)} layers')
-        self.absent = {name: one for name, one in self.absent.items() if name not in layers}
+        count = MOST_LAYERS if self._plan is None else len(self._plan.layers)
+        layers, self.absent = LAYERS[:count], absent_layers(count)
         of_prior, bevel = self._prior, 'load of the bevel beyond the nominal one'
         self.variables: Mapping[str, Variable] = {
             'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),

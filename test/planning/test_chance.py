@@ -287,6 +287,7 @@ def test_invalid_population_is_one_line(tmp_path: Path, text: str, reason: str) 
         ({'radius': 0.0}, 'radius must be finite, > 0 m'),
         ({'radius': float('nan')}, 'radius must be finite, > 0 m'),
         ({'population': {'entry_y': 1e-3}}, 'entry_y'),
+        ({'population': {'layer_8': 1.1}}, 'layer_8 is not in the plan, which has'),
         ({'population': {'entry_x': {'normal': [0.0]}}}, 'entry_x: normal takes'),
         ({'population': {'skin': {'normal': [0.0, 1.0]}}}, 'truncate it'),
         ({'law': 'magic'}, 'magic'),
