@@ -22,6 +22,7 @@ from needle_ros.quantities import DEVIATION_OVER_MEDIAN, NORMAL
 import numpy as np
 
 _OUTLIER: Final = 5.0  #: Distance of an outlier from the median, in standard deviations.
+_FARTHEST: Final = 0.1  #: Largest distance of the tip from the guide before an insertion [m].
 _FEW: Final = 3  #: Least number of readings for outlier rejection.
 
 SAME: Final = 1e-6  #: Tolerance of equal positions [m, rad].
@@ -187,13 +188,21 @@ class GuardedLaw:
             self._check_slip(measured, depth)
             tip = measured.tip[[0, 2]]
             if at == 0:
-                self._aside = float(np.hypot(*tip))
+                self._check_origin(tip)
             self._scatter = max(self._scatter, measured.error * sqrt(measured.readings))
             noise = max(measured.error, self._scatter / sqrt(measured.readings))
         self._check_sensor(tip)
         with guarded(self.law):
             self.law.update(tip, at, noise)
         self.report = report_of(self.law)
+
+    def _check_origin(self, tip: FloatArray) -> None:
+        self._aside = float(np.hypot(*tip))
+        if self._aside > _FARTHEST:
+            raise SteeringFaultError(
+                f'the tip is {1e3 * self._aside:.0f} mm beside the guide before the insertion, at '
+                f'most {1e3 * _FARTHEST:g} mm: is it in m, and in the frame of the target?'
+            )
 
     def _check_slip(self, measured: AveragedTipMeasurement, depth: float) -> None:
         """Compare the depth of the tip with the insertion depth [m]."""

@@ -205,7 +205,10 @@ def build_law(
 
 def checked_tip(tip: ArrayLike | None, name: str = 'a tip measurement') -> FloatArray:
     """Return a tip measurement x, z [m], nan if it is missing."""
-    found = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
+    try:
+        found = np.full(2, nan) if tip is None else np.array(tip, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ShapeError(f'{name} must be x and z, got {shortened(tip)}') from None
     if found.shape != (2,):
         raise ShapeError(f'{name} must be x and z, got shape {found.shape}')
     return found

@@ -19,7 +19,7 @@ from needle_controller.steering.settings import (
 )
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
-from needle_dynamics.steering.parameters import SteeringParameters
+from needle_dynamics.steering.parameters import longest_insertion, SteeringParameters
 from needle_ros.errors import JobError, NeedleError, ParameterError
 import numpy as np
 
@@ -118,6 +118,12 @@ class InsertionPlanner:
             )
         if self.plan is not None:
             return self.plan.tip_path.since(depth).depths
+        most = longest_insertion(self.needle, self.steering)
+        if point[1] > most:
+            raise ParameterError(
+                f'the target must be at a depth of at most {1e3 * most:g} mm with this needle, '
+                f'got {1e3 * point[1]:g} mm; targets are in m'
+            )
         return step_depths(point[1], settings.step_length, depth)
 
     def start(self, request: PlannedInsertion) -> None:

@@ -73,11 +73,11 @@ _PATHS: Final = (1.0, 10.0, 100.0)  #: Hypotheses of path noise, relative to the
 #: Slow errors of the sensor relative to `SteeringPrior.drift`, and logarithm of their weights.
 #: With equal weights, the first measurements of a precise sensor would be doubted.
 _DRIFTS: Final = {0.0: 0.0, 1.0: 0.0, 3.0: -2.0}
-_DRIFT_LENGTH: Final = 0.05  #: Correlation length of the slow error of the sensor [m].
+DRIFT_LENGTH: Final = 0.05  #: Correlation length of the slow error of the sensor [m].
 _BEYOND: Final = 1.1  #: Half width of the grid over the spread.
 _ELEMENT: Final = 1.25e-3  #: Longest element [m]: good to a few micrometers.
 _SAME: Final = 1e-9  #: Tolerance of equal depths [m].
-_BEVEL: Final = 3  #: Index of the load of the bevel among the causes.
+BEVEL: Final = 3  #: Index of the load of the bevel among the causes.
 _LEAST_SPREAD: Final = 1e-3  #: Least half width of a difference over the stiffness of a layer.
 _EVEN: Final = 12.0**-0.5  #: Standard deviation of a uniform distribution over a cell of the grid.
 
@@ -197,12 +197,12 @@ class SteeringModel:
         apart = np.abs(at[:, np.newaxis] - at) / b.path_noise_length
         path = np.exp(-apart) / (2.0 * b.path_noise_length)
         self.state_prior = StatePrior(
-            known=_covariance(causes[:, :, :_BEVEL], known, n + 1),
-            wandering=_covariance(causes[:, :, _BEVEL + 1 :], path, n + 1),
+            known=_covariance(causes[:, :, :BEVEL], known, n + 1),
+            wandering=_covariance(causes[:, :, BEVEL + 1 :], path, n + 1),
             deviations=np.array([b.bevel, _EVEN, _EVEN, *spreads]),
             noises=np.repeat(kinds[:, 0], points),
             drifts=np.repeat(kinds[:, 1], points),
-            decay=np.exp(-np.diff(at) / _DRIFT_LENGTH),
+            decay=np.exp(-np.diff(at) / DRIFT_LENGTH),
         )
 
     @property

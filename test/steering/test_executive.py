@@ -150,6 +150,17 @@ def test_tip_beside_the_guide_is_a_warning(offset: float, severity: Severity) ->
     assert bool(reported) == warned
 
 
+@pytest.mark.requirement('S-329')
+def test_tip_far_from_the_guide_stops_before_the_insertion() -> None:
+    """Such as a tip in mm."""
+    robot = Robot()
+    robot.sees = lambda tip: np.add(tip, (1.76, 0.0, 0.0))
+    robot.steer()
+    assert robot.loop.phase is Phase.STOPPED
+    assert 'the tip is 1760 mm beside the guide before the insertion' in robot.loop.fault
+    assert not robot.at.any()
+
+
 @pytest.mark.requirement('S-124')
 def test_late_and_lost_readings_are_tolerated() -> None:
     """Ultrasound: 66 ms late, one in four ticks, 5 % lost."""
@@ -546,7 +557,12 @@ def test_clock_set_back_stops_the_insertion() -> None:
         ((np.nan, 0.06, 0.0), '', 'target must be finite'),
         (TARGET, 'needle_base', "target must be in frame '' or 'needle_entry', got 'needle_base'"),
         ((0.05, 0.06, 0.0), '', 'x = 50.00 mm, z = 0.00 mm is out of reach'),
-        ((0.0, 0.2, 0.0), '', r'depths must be in \[0, 0.16\] m'),
+        (
+            (0.0, 0.2, 0.0),
+            '',
+            'at a depth of at most 160 mm with this needle, got 200 mm; targets are',
+        ),
+        ((4.0, 80.0, -2.0), '', 'got 80000 mm; targets are in m'),
         ((0.0, 0.0, 0.0), '', 'the needle is at 0.00 mm already'),
     ],
 )

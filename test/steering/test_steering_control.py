@@ -452,6 +452,31 @@ def test_frame_error_of_ten_degrees_is_tolerated_or_detected(seed: int) -> None:
         assert np.hypot(*(turn @ plant.tip - target)) < 5e-4
 
 
+@pytest.mark.requirement('S-328')
+@pytest.mark.parametrize('mirrored', [False, True])
+@pytest.mark.parametrize('quarters', range(4))
+def test_exchanged_and_reversed_axes_stop_the_needle(quarters: int, mirrored: bool) -> None:
+    """Within 60 of 100 mm; with the right axes the needle arrives."""
+    turn = np.linalg.matrix_power([[0, -1], [1, 0]], quarters) @ np.diag([1, 1 - 2 * mirrored])
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        one = SteeredNeedle(*other(1.0 + 0.25 * rng.uniform(-1.0, 1.0)), tilt=(0.02, -0.01))
+        law = MultiHypothesisLaw(MODEL, 3e-3 * rng.uniform(-1.0, 1.0, 2), SteeringLimits())
+        noise, measure = sensor(1e-4, seed), partial(np.matmul, turn)
+        plant, said = SteeringPlant(one, DEPTHS), ''
+        try:
+            simulate_steering(law, plant, lambda tip: measure(noise(tip)))  # noqa: B023
+        except SteeringFaultError as error:
+            said = str(error)
+        if quarters or mirrored:
+            assert 'the tip responds to the guide as if the sensor measured' in said
+            assert one.depth <= 0.06
+        else:
+            assert not said
+            # The largest miss of the page of results is below 1 mm.
+            assert np.hypot(*(plant.tip - law.target)) < 1e-3
+
+
 def test_invalid_input_is_rejected() -> None:
     for depths in ([0.0, 0.05, 0.05], [0.05], [[0.0, 0.1]], [0.0, np.nan]):
         with pytest.raises(ParameterError, match='depths must be numbers that increase'):
@@ -484,6 +509,11 @@ def test_invalid_input_is_rejected() -> None:
     controller = MultiHypothesisLaw(MODEL, (0.0, 0.0), LIMITS)
     with pytest.raises(ShapeError, match='a tip measurement must be x and z'):
         controller.update([0.0, 0.0, 0.0], 0)
+    with pytest.raises(ShapeError, match="a tip measurement must be x and z, got 'left'"):
+        controller.update('left', 0)
+    for noise in (-1e-4, np.nan, np.inf):
+        with pytest.raises(ParameterError, match='noise must be finite, >= 0 m'):
+            controller.update([0.0, 0.0], 0, noise)
     done = MultiHypothesisLaw(MODEL, (0.0, 0.0), LIMITS)
     steer(done, SteeredNeedle(*other(1.0)))
     with pytest.raises(JobError, match='all 20 steps are done'):

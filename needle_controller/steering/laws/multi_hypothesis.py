@@ -50,6 +50,7 @@ from needle_controller.steering.law import (
 )
 from needle_controller.steering.planned_path import PlannedPath
 from needle_controller.steering.responses import SteeringModel
+from needle_controller.steering.sensor_axes import SensorAxes
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics.arrays import ComplexArray, FloatArray
 from needle_ros.errors import JobError, ParameterError, ShapeError
@@ -134,7 +135,7 @@ class MultiHypothesisLaw(SteeringLaw):
             size += model.steps
         mean = np.zeros((count, size), dtype=np.complex128)
         mean[:, tips + hypotheses.BEVEL] = 1j * model.push
-        self._model = model
+        self._model, self._axes = model, SensorAxes(model)
         self._use(hypotheses.Steering(
             responses=model.responses,
             prior=model.state_prior,
@@ -309,12 +310,17 @@ class MultiHypothesisLaw(SteeringLaw):
             raise JobError(f'all {self._model.steps} steps are done')
         self._check_depth(at, self.step)
         x, z = checked_tip(tip).tolist()
+        noise = checked('noise', noise, 'm', low=0.0)
         variance = max(self._model.prior.noise, noise) ** 2
         self._hit_probability = None
         if self._now.counts[hypotheses.MEASURED] == self._now.learned.shape[1]:
             self._extend()
+        before = self._now.counts[hypotheses.MEASURED]
         kind, off_x, off_z = hypotheses.update(self._boxed, at, x, z, variance)
         if kind == hypotheses.VALID:
+            used = self._now.counts[hypotheses.MEASURED] > before
+            if used and self._now.counts[hypotheses.GROSS] == 0:
+                self._axes.check(at, complex(x, z), self._now.guide, variance)
             return
         if kind == hypotheses.LOST:
             missing = self._now.counts[hypotheses.MISSING]
