@@ -31,6 +31,7 @@ from needle_identification.recordings.units import (
     BRACKETS,
     foreign_unit,
     ONLY_IN_BRACKETS,
+    states_unit,
     unit_of,
     UNITS,
 )
@@ -171,7 +172,7 @@ def column_of(table: Table, spec: str) -> str:
 def with_unit(role: str, name: str, values: FloatArray) -> str:
     """Return a column with the probable unit if its name states none and its values are large."""
     finite = values[np.isfinite(values)]
-    if unit_of(name, role) is not None or len(finite) < 2 or plain_name(name) in _SECONDS:
+    if states_unit(name, role) or len(finite) < 2 or plain_name(name) in _SECONDS:
         return name
     size = np.median(np.diff(finite)) if role == 'time' else np.ptp(finite)
     probable = [f'{name}[{unit}]' for unit, least in _SUSPICIOUS.get(role, ()) if size > least]
@@ -185,11 +186,11 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
         both = [_column(table, role, name)[1] for name in (seconds, nanoseconds)]
         # Relative to the start: the sum may exceed the precision of a float.
         return np.asarray((both[0] - both[0][np.isfinite(both[0])][:1].sum()) + 1e-9 * both[1])
-    if spec in table.columns:
+    sign, rest = (1.0, spec) if spec in table.columns else signed(spec)
+    if rest in table.columns:
         # The name itself contains brackets.
-        sign, name, factor, unit = 1.0, spec, None, None
+        name, factor, unit = rest, None, None
     else:
-        sign, rest = signed(spec)
         match = _SPEC.match(rest)
         if match is None:
             raise RecordingError(f'--columns {role}={spec} is not [-]NAME[*FACTOR][UNIT]')

@@ -14,7 +14,8 @@ _LENGTHS: Final = {
     'cm': 1e-2,
     'in': _INCH,
     'inch': _INCH,
-    **{f'{micro}m': 1e-6 for micro in _MICRO},
+    'inches': _INCH,
+    **dict.fromkeys((*(f'{micro}m' for micro in _MICRO), 'micron', 'microns'), 1e-6),
 }
 _ANGLES: Final = {'rad': 1.0, 'deg': pi / 180.0}
 
@@ -60,3 +61,8 @@ def foreign_unit(name: str) -> str:
     match = BRACKETS.match(name)
     word = match[2].strip() if match else ''
     return '' if re.fullmatch(r'[\d\s,:.-]*', word) else word
+
+
+def states_unit(name: str, role: str) -> bool:
+    """Return whether a name states a unit, also one that is not known."""
+    return unit_of(name, role) is not None or foreign_unit(name) != ''

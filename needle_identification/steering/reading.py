@@ -28,7 +28,7 @@ from needle_identification.recordings import reading, tables
 from needle_identification.recordings.merging import merge
 from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import Table
-from needle_identification.recordings.units import unit_of, UNITS
+from needle_identification.recordings.units import states_unit, unit_of, UNITS
 from needle_identification.sensor.checks import zero_rows
 from needle_identification.steering.recording import DEEPEST, recorded_insertion, SteeringRecording
 from needle_ros import contract, wire
@@ -250,7 +250,7 @@ def steering_columns(table: Table, given: Mapping[str, str] | None = None) -> di
     units = _units(table, specs, given)
     depth = tables.measured_values(table.columns[specs['depth']])
     for role, unit in units.items():
-        if unit_of(specs[role], role) is None and unit:
+        if unit and not states_unit(specs[role], role):
             specs[role] = f'{specs[role]}[{unit}]'
     if is_inverted(depth):
         specs['depth'] = f'-{specs["depth"]}'
@@ -266,7 +266,7 @@ def is_inverted(depth: FloatArray) -> bool:
 def check_depth(table: Table, spec: str) -> None:
     """Raise a RecordingError if the unit of a depth that was found is not known."""
     name = spec.lstrip('-')
-    if name not in table.columns or unit_of(name, 'depth') is not None:
+    if name not in table.columns or states_unit(name, 'depth'):
         return
     if (span := float(np.ptp(tables.measured_values(table.columns[name])))) > DEEPEST:
         raise RecordingError(

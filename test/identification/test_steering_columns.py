@@ -9,7 +9,7 @@ import re
 from typing import Final
 
 from needle_dynamics.arrays import FloatArray
-from needle_identification import read_steering_recording
+from needle_identification import inspect_recording, read_steering_recording
 from needle_identification.errors import RecordingError
 import numpy as np
 from numpy.testing import assert_allclose
@@ -133,6 +133,38 @@ def inserted(depth: FloatArray) -> FloatArray:
 
 NAMES: Final = 'depth [m],guide_x [m],guide_z [m],tip_x [m],tip_z [m]'
 INTO: Final = np.linspace(0.0, 0.1, 21)
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize('unit', ['[counts]', '(px)', '[rev]'])
+@pytest.mark.parametrize('role', ['depth', 'guide_x', 'tip_z'])
+def test_an_unknown_unit_is_an_error(tmp_path: Path, role: str, unit: str, sign: float) -> None:
+    """Its numbers would be taken in mm, by their size; a unit in the option replaces it."""
+    rows = 1e3 * inserted(sign * INTO)
+    names = NAMES.replace('[m]', '[mm]').replace(f'{role} [mm]', f'{role} {unit}')
+    path = written(tmp_path / 'run.csv', names, rows)
+    words = f"the unit '{unit[1:-1]}' of the column '{role} {unit}' is not one of m, mm"
+    with pytest.raises(RecordingError, match=re.escape(words)):
+        read_steering_recording(path)
+    found = inspect_recording(path)
+    assert words.removeprefix('the') in found.lacking
+    assert f'{unit}[' not in found.command
+    # A depth that decreases has its sign in the option.
+    spec = f'{"-" * (role == "depth" and sign < 0.0)}{role} {unit}[mm]'
+    assert read_steering_recording(path, columns={role: spec}).depth.max() == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ('unit', 'factor'), [('inches', 0.0254), ('micron', 1e-6), ('microns', 1e-6)]
+)
+def test_words_for_units_of_length(tmp_path: Path, unit: str, factor: float) -> None:
+    rows = inserted(INTO)
+    expected = rows[:, 3:].copy()
+    rows[:, 3:] /= factor
+    names = NAMES.replace('tip_x [m],tip_z [m]', f'tip_x [{unit}],tip_z [{unit}]')
+    found = read_steering_recording(written(tmp_path / 'run.csv', names, rows))
+    # 18 digits in the file.
+    assert_allclose(found.tip, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize('names', ['time [s]', 'sec,nanosec'])
