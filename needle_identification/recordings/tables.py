@@ -179,8 +179,14 @@ def with_unit(role: str, name: str, values: FloatArray) -> str:
     return probable[-1] if probable else name
 
 
-def column_values(table: Table, role: str, spec: str, losses: list[str]) -> FloatArray:
-    """Return the values (n,) of a column in SI units, by its name with sign, factor and unit."""
+def column_values(
+    table: Table, role: str, spec: str, losses: list[str], option: str = '--columns'
+) -> FloatArray:
+    """
+    Return the values (n,) of a column in SI units, by its name with sign, factor and unit.
+
+    `option` is the option that can state a unit, '' without one.
+    """
     if role == 'time' and ':' in spec and spec not in table.columns:
         seconds, _, nanoseconds = spec.partition(':')
         both = [_column(table, role, name)[1] for name in (seconds, nanoseconds)]
@@ -198,9 +204,10 @@ def column_values(table: Table, role: str, spec: str, losses: list[str]) -> Floa
     name, column = _column(table, role, name)
     unit = unit or unit_of(name, role)
     if unit is None and (foreign := foreign_unit(name)):
+        remedy = f"use {option} '{role}={name}[UNIT]'" if option else 'rename the column'
         raise RecordingError(
             f'{table.path}: the unit {foreign!r} of the column {name!r} is not one of '
-            f"{', '.join(UNITS[role])} for {role}: use --columns '{role}={name}[UNIT]'"
+            f'{", ".join(UNITS[role])} for {role}: {remedy}'
         )
     if unit is not None and unit not in UNITS[role]:
         raise RecordingError(

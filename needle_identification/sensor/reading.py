@@ -108,15 +108,17 @@ def _positions(
     table = tables.read_table(path)
     specs, losses = {**tables.guessed(table.columns, _USUAL), **columns}, list(table.losses)
     roles = ['time', *(f'tip_{axis}' for axis in axes)]
+    option = '--truth-columns' if wanted is _TRUTH else '--columns'
     if missing := [role for role in roles if role not in specs]:
-        option = '--truth-columns' if wanted is _TRUTH else '--columns'
         raise RecordingError(
             f'{path}: no column found for {" and ".join(missing)}, it has '
             f'{", ".join(table.columns)}: use {option} {missing[0]}=NAME,...'
         )
     if words := ', '.join(f'{role}={specs[role]}' for role in roles if role not in columns):
         losses.append(f'columns by their names: {words}')
-    times, *tips = (tables.column_values(table, role, specs[role], losses) for role in roles)
+    times, *tips = (
+        tables.column_values(table, role, specs[role], losses, option) for role in roles
+    )
     rows = np.column_stack(tips)
     start, stamps, found = tables.sorted_rows(path, times, rows, losses)
     if not abs(start) < _LATEST:

@@ -185,7 +185,12 @@ def _read_motion(path: Path, to: float) -> tuple[_Motion, list[str]]:
             f'{", ".join(read.columns)}'
         )
     losses = list(read.losses)
-    motion = {name: column_values(read, name, column, losses) for name, column in found.items()}
+    if unused := [name for name in read.columns if name not in found.values()]:
+        losses.append(f'columns not used: {", ".join(unused)}; valid: {", ".join(names)}')
+    motion = {
+        name: column_values(read, name, column, losses, option='')
+        for name, column in found.items()
+    }
     if not all(np.isfinite(values).all() for values in motion.values()):
         raise RecordingError(f'{path} has values that are not numbers')
     if len(motion['depth']) < 1 or not (np.diff(motion['depth']) > 0.0).all():

@@ -96,7 +96,7 @@ def test_invalid_input_is_named(
 def test_motion_that_is_not_used_is_a_warning(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of a column in mm without a unit, and of rows beyond the target depth."""
+    """Of columns in mm without a unit or of other names, and rows beyond the target depth."""
     way = tmp_path / 'way.csv'
     words = ['--model', 'steering', '--to', '70mm', '--motion', str(way), '--json']
     way.write_text('depth,guide_x\n0,0\n30,0\n60,3\n')
@@ -110,6 +110,11 @@ def test_motion_that_is_not_used_is_a_warning(
     way.write_text('depth [mm],guide_x [mm],guide_z\n0,0,0\n30,0,0\n70,3,0.003\n')
     assert said(capsys, *words)[1] == ''
     assert said(capsys, *words[:2], *words[4:])[1] == ''
+    way.write_text('depth [mm],guide_x [mm],rol [deg],guide [mm]\n0,0,0,0\n30,0,0,0\n70,3,4,5\n')
+    assert said(capsys, *words)[1] == (
+        f'warning: {way}: columns not used: rol [deg], guide [mm]; valid: depth, guide_x, '
+        'guide_z, tilt_x, tilt_z, roll\n'
+    )
     way.write_text('depth [mm],guide_x [mm]\n0,0\n30,0\n71,3\n')
     assert 'its depths, 0 to 71 mm, continue beyond --to, 70 mm' in said(capsys, *words)[1]
 
@@ -120,6 +125,7 @@ def test_motion_that_is_not_used_is_a_warning(
         ('depth,roll\n0,0\n0,1\n', 'depth must increase from row to row'),
         ('depth,force\n0,0\n1,1\n', 'must have the columns depth and any of guide_x'),
         ('depth,roll\n0,0\n0.1,nan\n', 'has values that are not numbers'),
+        ('depth,roll [rev]\n0,0\n1,1\n', 'is not one of rad, deg for roll: rename the column\n'),
     ],
 )
 def test_invalid_guide_tables_are_named(

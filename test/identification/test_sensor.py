@@ -337,9 +337,14 @@ def test_columns_have_units_signs_and_axes(tmp_path: Path) -> None:
     ):
         with pytest.raises((RecordingError, ParameterError), match=complaint):
             read_sensor_recording(log, truth, **words)
+    pixels = write_table(tmp_path / 'px.csv', one.true_time, one.true_tip, 'time,x [px],y,z')
+    own = write_table(tmp_path / 'own.csv', one.time, one.tip)
+    for paths, option in (((pixels, own), '--columns'), ((own, pixels), '--truth-columns')):
+        with pytest.raises(RecordingError, match=f"the unit 'px' .* use {option} 'tip_x=x "):
+            read_sensor_recording(*paths)
     late = write_table(tmp_path / 'late.csv', one.true_time + 1e6, one.true_tip)
     with pytest.raises(RecordingError, match=r'do not overlap in time; they last from 0\.025 to'):
-        read_sensor_recording(write_table(tmp_path / 'own.csv', one.time, one.tip), late)
+        read_sensor_recording(own, late)
     with pytest.raises(ParameterError, match=r'a constant position is x, y, z \[m\]'):
         read_sensor_recording(late, (0.0, 0.05))
 
