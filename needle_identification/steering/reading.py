@@ -30,7 +30,12 @@ from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import Table
 from needle_identification.recordings.units import states_unit, unit_of, UNITS
 from needle_identification.sensor.checks import zero_rows
-from needle_identification.steering.recording import DEEPEST, recorded_insertion, SteeringRecording
+from needle_identification.steering.recording import (
+    DEEPEST,
+    JITTER,
+    recorded_insertion,
+    SteeringRecording,
+)
 from needle_ros import contract, wire
 from needle_ros.quantities import signed, signed_axis
 import numpy as np
@@ -74,6 +79,7 @@ TIP_ALONG: Final = {'along': ('tipy', 'ytip', 'tip2')}  #: Position along the ne
 _RUN: Final = 10  # least mean number of rows of each of several insertions in one table
 _OUTSIDE: Final = 0.1  # depth of a needle that is withdrawn, as a part of the deepest
 _INSIDE: Final = 0.25  # depth of an insertion, as a part of the deepest
+_FALL: Final = 0.2  # fall of the depth in one row to another insertion, as a part of the deepest
 _MOVED_ROLES: Final = ('depth', 'guide_x', 'guide_z')
 _COMPONENT: Final = re.compile(r'[\s._-]*[xyz]$', re.IGNORECASE)  # ``x`` of ``Base x``
 
@@ -197,7 +203,10 @@ def _of_table(path: Path, columns: Mapping[str, str], medium: str) -> SteeringRe
     name = f'{"-" * spec.startswith("-")}{tables.column_of(table, spec)}'
     advice = f"is {spec} in mm? Use --columns 'depth={name}[mm]'"
     found = recorded_insertion(path, medium, values, losses, advice)
-    if again := _second_insertion(found.depth):
+    again = min(
+        filter(None, (_second_insertion(found.depth), _begun_again(found.depth))), default=0
+    )
+    if again:
         # Rows are left out at the start only.
         row = int(np.flatnonzero(used)[again - len(found.depth)]) + 1
         raise RecordingError(
@@ -227,6 +236,19 @@ def _second_insertion(depth: FloatArray) -> int:
         if between.min() < _OUTSIDE * depth.max():
             # The last row before the insertion.
             return int(end - 1 - np.argmin(between[::-1]))
+    return 0
+
+
+def _begun_again(depth: FloatArray) -> int:
+    """Return the row to which a depth falls at once and from which it grows, else 0."""
+    least = _FALL * depth.max()
+    falls = np.diff(depth, prepend=depth[0]) < -least
+    # Two falls, one after the other, are a withdrawal in long steps.
+    for row in np.flatnonzero(falls[1:] & ~falls[:-1]) + 1:
+        later = depth[row:] - depth[row]
+        grown = int(np.argmax(later > least))
+        if grown and later[:grown].min() > -JITTER:
+            return int(row)
     return 0
 
 

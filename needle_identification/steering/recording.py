@@ -27,7 +27,7 @@ _LEVER: Final = 0.01  # motion for a roll of 1 rad [m]
 _MOST: Final = 100  # readings of a recording: one per millimeter of a path of 100 mm
 _JUMP: Final = 0.01  # smallest guide position after rows of zeros that is no motion [m]
 _AT_THE_SKIN: Final = 0.03  # largest first depth that is measured from the skin [m]
-_JITTER: Final = 1e-3  # largest height above the skin of a robot at rest on it [m]
+JITTER: Final = 1e-3  #: Largest motion of a robot at rest [m].
 _ASIDE: Final = 0.03  # lateral tip position beyond the guide and half the depth [m]
 
 ORDERS: Final = ('together', 'guide first')  #: order of guide motion and insertion between samples
@@ -183,13 +183,13 @@ def recorded_insertion(
     if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
         losses.append(f'depths relative to the first depth, {1e3 * depth[0]:.4g} mm, at the skin')
         depth = depth - depth[0]
-    outside = np.flatnonzero(depth[: np.argmax(depth)] < -_JITTER)
+    outside = np.flatnonzero(depth[: np.argmax(depth)] < -JITTER)
     if len(outside) and depth.min() >= -_AT_THE_SKIN:
         first = int(outside[-1]) + 1
         losses.append(f'{first} rows before the needle enters the skin, left out')
         values = {role: column[first:] for role, column in values.items()}
         depth = depth[first:]
-    if depth.min() < -_JITTER:
+    if depth.min() < -JITTER:
         raise RecordingError(
             f'{path}: depth goes from the first row to {1e3 * depth.min():.4g} mm, out of the '
             f'skin: if it is positive out of the tissue, use --columns depth=-NAME'

@@ -192,10 +192,35 @@ def test_a_second_insertion_in_a_table_is_an_error(
         read_steering_recording(path)
 
 
+@pytest.mark.parametrize('begin', [3, 8])
+@pytest.mark.parametrize('rest', [1, 3])
+@pytest.mark.parametrize('out', [0, 2])
+def test_insertions_that_begin_in_the_tissue_are_an_error(
+    tmp_path: Path, begin: int, rest: int, out: int
+) -> None:
+    """At 15 or 40 mm, with several rows at each depth, and with the begin of the withdrawal."""
+    one = [*INTO[begin:], *INTO[-2 : -2 - out : -1]]
+    # The robot at rest moves by micrometers.
+    depth = np.repeat(one * 4, rest)
+    depth += 1e-6 * np.random.default_rng(0).normal(size=len(depth))
+    path = written(tmp_path / 'runs.csv', NAMES, inserted(depth))
+    words = f'second insertion starts at row {rest * len(one) + 1} of {len(depth)}, with a depth'
+    with pytest.raises(RecordingError, match=words):
+        read_steering_recording(path)
+
+
 def test_a_needle_that_is_withdrawn_is_one_insertion(tmp_path: Path) -> None:
-    """Slowly at the end, and by a part before the insertion continues."""
-    out = np.linspace(0.1, 0.0, 100)
-    for depth in ([*INTO, *out], [*INTO[:11], *INTO[10:5:-1], *INTO[6:]], [0.0, 5e-3, *INTO]):
+    """Slowly or in long steps, at the end or before the insertion continues, with rows missing."""
+    out, back = np.linspace(0.1, 0.0, 100), INTO[16:7:-1]
+    for depth in (
+        [*INTO, *out],
+        [*INTO, *out[::30]],
+        [*INTO[:11], *INTO[10:5:-1], *INTO[6:]],
+        [0.0, 5e-3, *INTO],
+        [*INTO, *INTO[15:5:-5], *INTO[5:]],
+        [*INTO[:17], *back[6:], *INTO[9:]],
+        [*INTO[:4], *INTO[12:]],
+    ):
         path = written(tmp_path / 'run.csv', NAMES, inserted(np.array(depth)))
         assert len(read_steering_recording(path).depth) == len(depth)
 
