@@ -183,6 +183,11 @@ def recorded_insertion(
     if not 0.0 <= depth[0] <= _AT_THE_SKIN or depth.min() < 0.0:
         losses.append(f'depths relative to the first depth, {1e3 * depth[0]:.4g} mm, at the skin')
         depth = depth - depth[0]
+    elif depth[0] > JITTER:
+        losses.append(
+            f'the first depth is {1e3 * depth[0]:.4g} mm: the needle counts as straight to it; if '
+            'the tip was at the skin there, subtract it from the depth'
+        )
     outside = np.flatnonzero(depth[: np.argmax(depth)] < -JITTER)
     if len(outside) and depth.min() >= -_AT_THE_SKIN:
         first = int(outside[-1]) + 1

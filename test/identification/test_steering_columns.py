@@ -90,6 +90,27 @@ def test_rows_before_the_skin_are_left_out(tmp_path: Path) -> None:
         read_steering_recording(written(tmp_path / 'wrong.csv', names, rows))
 
 
+@pytest.mark.parametrize(
+    ('first', 'start', 'words'),
+    [
+        (0.0, 0.0, None),
+        (0.9, 0.9, None),
+        (15.0, 15.0, 'the first depth is 15 mm: the needle counts as straight to it; if'),
+        (29.0, 29.0, 'the first depth is 29 mm: the needle counts as straight to it; if'),
+        (40.0, 0.0, 'depths relative to the first depth, 40 mm, at the skin'),
+    ],
+)
+def test_the_depth_of_the_skin_is_stated(
+    tmp_path: Path, first: float, start: float, words: str | None
+) -> None:
+    rows = 1e3 * inserted(1e-3 * first + INTO)
+    path = written(tmp_path / 'run.csv', NAMES.replace('[m]', '[mm]'), rows)
+    found = read_steering_recording(path)
+    assert_allclose(found.depth, 1e-3 * start + INTO, atol=1e-12)
+    said = [line for line in found.losses if 'first depth' in line]
+    assert [line[: len(words or '')] for line in said] == [words] * (words is not None)
+
+
 def test_a_depth_in_mm_or_cm_needs_its_unit(tmp_path: Path) -> None:
     rows = np.column_stack([np.linspace(0.0, 10.0, 11), *np.full((4, 11), 0.001)])
     rows[:, 3] += np.linspace(0.0, 0.002, 11)
