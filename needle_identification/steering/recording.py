@@ -16,7 +16,9 @@ from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import freeze
 from needle_identification.sensor.checks import zero_rows
 from needle_ros.errors import ShapeError
+from needle_ros.quantities import DEVIATION_OVER_MEDIAN
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 DEEPEST: Final = 1.0  #: largest depth [m]
 
@@ -29,6 +31,10 @@ _JUMP: Final = 0.01  # smallest guide position after rows of zeros that is no mo
 _AT_THE_SKIN: Final = 0.03  # largest first depth that is measured from the skin [m]
 JITTER: Final = 1e-3  #: Largest motion of a robot at rest [m].
 _ASIDE: Final = 0.03  # lateral tip position beyond the guide and half the depth [m]
+_FAR: Final = 10.0  # deviation of a single tip position from the rows around [robust deviations]
+_APART: Final = 3e-3  # its least deviation, without the motion of the guide there [m]
+_AROUND: Final = 5  # rows of this motion
+_NAMED: Final = 5  # most depths in a message
 
 ORDERS: Final = ('together', 'guide first')  #: order of guide motion and insertion between samples
 
@@ -151,16 +157,41 @@ def credible(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> tuple[Boo
             frozen[begin + 1 : end] = True
     far = np.abs(guide).max(initial=0.0) + 0.5 * depth + _ASIDE
     wild = there & ~frozen & (np.abs(np.nan_to_num(tip)) > far[:, np.newaxis]).any(axis=1)
+    good = there & ~frozen & ~wild
+    single = np.zeros_like(good)
+    single[good] = _single(depth[good], guide[good], tip[good])
+    depths = [f'{1e3 * one:.4g}' for one in depth[single]]
+    named = ', '.join(depths[:_NAMED]) + ', ...' * (len(depths) > _NAMED)
     losses = [
         f'{count} samples of the tip {why}, left out'
         for count, why in (
             (np.count_nonzero(frozen), 'repeated during the insertion (frozen sensor)'),
             (np.count_nonzero(wild), 'at implausible positions'),
+            (np.count_nonzero(single), f'far from the rows around, at depths [mm] of {named}'),
             (np.count_nonzero(~there), 'that are not numbers'),
         )
         if count
     ]
-    return there & ~frozen & ~wild, losses
+    return good & ~single, losses
+
+
+def _single(depth: FloatArray, guide: FloatArray, tip: FloatArray) -> BoolArray:
+    """Return which tip positions are far from the rows before and after, which are alike."""
+    single = np.zeros(len(depth), dtype=np.bool_)
+    if len(depth) < _AROUND:
+        return single
+    steps = np.abs(np.diff(depth))
+    way = steps[:-1] + steps[1:]
+    part = np.divide(steps[:-1], way, out=np.full_like(way, 0.5), where=way > 0.0)[:, np.newaxis]
+    between = tip[2:] - tip[:-2]
+    off = np.hypot(*(tip[1:-1] - tip[:-2] - part * between).T)
+    moved = maximum_filter1d(guide, _AROUND, axis=0) - minimum_filter1d(guide, _AROUND, axis=0)
+    # The tip follows the guide, late or in part, in all but a quarter of the rows.
+    least = max(_APART, _FAR * DEVIATION_OVER_MEDIAN * float(np.quantile(off, 0.25)))
+    beyond = off - np.hypot(*moved[1:-1].T) > least
+    # If the tip moves on, the rows before and after are farther apart.
+    single[1:-1] = beyond & (off > np.hypot(*between.T))
+    return single
 
 
 def _unset(values: Mapping[str, FloatArray]) -> int:

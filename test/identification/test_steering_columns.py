@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import pi
 from pathlib import Path
 import re
 from typing import Final
 
+from benchmarks.steering_fit import drawn, FitTruth, insertion
 from needle_dynamics.arrays import FloatArray
 from needle_identification import inspect_recording, read_steering_recording
 from needle_identification.errors import RecordingError
+from needle_identification.steering.recording import credible
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -294,6 +297,37 @@ def test_a_needle_of_more_than_1_m_is_an_error(
         read_steering_recording(path, columns={'depth': spec})
     right = {'depth': words.partition('depth=')[2].rstrip("'") or 'd[mm]'}
     assert read_steering_recording(path, columns=right).depth.max() < 0.2
+
+
+@pytest.mark.parametrize('noise', [1.8e-4, 1e-3])
+@pytest.mark.parametrize('steer', [3e-4, 1.5e-3, 4e-3])
+def test_readings_of_a_steered_needle_are_credible(steer: float, noise: float) -> None:
+    """With motions of the guide of several millimeters between rows, and much noise."""
+    for seed in range(40):
+        for truth in (FitTruth(), drawn(seed)):
+            one = insertion(seed, replace(truth, noise=noise), steer=steer)
+            good, words = credible(one.depth, one.guide - one.guide[0], one.tip - one.tip[0])
+            assert good.all()
+            assert not words
+
+
+@pytest.mark.parametrize('row', [1, 9, 19])
+def test_a_single_position_far_from_the_others_is_discarded(tmp_path: Path, row: int) -> None:
+    """By 15 mm; a tip that stays there, or rows that are missing, are measured."""
+    one = insertion(3)
+    rows = np.column_stack([one.depth, one.guide, one.tip])
+    rows[row, 3] += 0.015
+    found = read_steering_recording(written(tmp_path / 'run.csv', NAMES, rows))
+    assert (~found.known).nonzero()[0].tolist() == [row]
+    depth = 1e3 * one.depth[row]
+    words = f'1 samples of the tip far from the rows around, at depths [mm] of {depth:g}, left out'
+    assert words in found.losses
+    rows[row + 1 :, 3] += 0.015
+    found = read_steering_recording(written(tmp_path / 'step.csv', NAMES, rows))
+    assert found.known.all()
+    rows = np.delete(np.column_stack([one.depth, one.guide, one.tip]), np.s_[2:8], axis=0)
+    found = read_steering_recording(written(tmp_path / 'gap.csv', NAMES, rows))
+    assert found.known.all()
 
 
 def test_second_insertion_of_a_bag_is_left_out(tmp_path: Path) -> None:
