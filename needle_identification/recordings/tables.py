@@ -71,6 +71,7 @@ _SUSPICIOUS: Final = {
 }
 _SECONDS: Final = ('sec', 'seconds')  #: Names of times that are in s.
 _BLANKS: Final = re.compile(r'(?i)(([-+]?\d+(,\d+)?(e[-+]?\d+)?|nan)( +|$)){2,}')  # decimal commas
+_COMMAS: Final = re.compile(r'\s*[-+]?\d+,\d+(\s*,\s*[-+]?\d+,\d+)+\s*')  # between columns, too
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
 _SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
 
@@ -317,6 +318,13 @@ def _text(path: Path) -> Table:
         raise RecordingError(f'{path} has no line of numbers among its first {len(head)}')
     separator = _separator(head[first])
     count = len(_split(head[first], separator))
+    if _COMMAS.fullmatch(head[first]) and any(
+        2 * len(_split(line, separator)) == count for line in head[:first]
+    ):
+        raise RecordingError(
+            f'{path}: rows have {count} values and the header {count // 2} names: with decimal '
+            'commas, columns need another separator'
+        )
     names = _names(head[:first], separator, count)
     try:
         table = np.loadtxt(

@@ -84,6 +84,18 @@ def test_unknown_unit_is_rejected(tmp_path: Path, run: Any, head: str, unit: str
     assert_allclose(read_friction_recording(path, columns=given).force, run[2], rtol=1e-8)
 
 
+def test_decimal_commas_between_commas_are_named(tmp_path: Path, run: Any) -> None:
+    """Each number is two values then; whole numbers in pairs are values if each has a name."""
+    time, depth, force = run
+    head = 'time [s],depth [m],force [N]'
+    rows = lines(head, time, depth, force, separator=';').replace('.', ',').replace(';', ',')
+    words = 'rows have 6 values and the header 3 names: with decimal commas, columns need another'
+    with pytest.raises(RecordingError, match=words):
+        read_table(written(tmp_path, rows))
+    whole = '\n'.join(['a,b,c,d', *(f'{k},{k},-{k},{k}' for k in range(9))])
+    assert [*read_table(written(tmp_path, whole)).columns] == ['a', 'b', 'c', 'd']
+
+
 def test_units_of_inches_and_indices(tmp_path: Path, run: Any) -> None:
     """Inches are read in brackets; an index in brackets is no unit, an ending no inch."""
     time, depth, force = run
