@@ -11,6 +11,7 @@ import numpy as np
 
 EXACT: Final = 1e-9  #: Largest change of positions that is rounding [m].
 _RARE: Final = 1e-3  # probability of a longer run in a whole recording
+_HELD: Final = 0.75  # part of the positions that repeat in a log at a higher rate
 _COARSE: Final = 1.5  # steps over the noise above which runs last as long as slow noise
 _LIKELY: Final = 1.5  # power of the probability of the most likely step: up to here, at most
 _CLEARLY: Final = 4.5  # smallest difference of axes [standard errors]
@@ -21,14 +22,17 @@ def measured_rows(tip: FloatArray) -> tuple[BoolArray, list[str]]:
     """Return which rows of positions (n, k) are measurements, and a sentence for the others."""
     zero = zero_rows(tip)
     frozen = np.zeros_like(zero)
-    frozen[~zero] = _frozen(tip[~zero])
+    frozen[~zero], is_held = _repeated(tip[~zero])
+    held = 'left out, as of a log at a higher rate than that of the sensor'
     words = []
-    for lost, what in ((zero, 'zero'), (frozen, 'exactly as the one before')):
+    for lost, what, so in (
+        (zero, 'zero', 'counted as lost'),
+        (frozen, 'exactly as the one before', held if is_held else 'counted as lost'),
+    ):
         places = np.count_nonzero(np.diff(lost.astype(np.int8), prepend=0) > 0)
         if places:
             words.append(
-                f'{np.count_nonzero(lost)} positions are {what}, in {places} places: counted as '
-                'lost'
+                f'{np.count_nonzero(lost)} positions are {what}, in {places} places: {so}'
             )
     return ~(zero | frozen), words
 
@@ -48,21 +52,22 @@ def _is_among(tip: FloatArray) -> bool:
     return bool((np.abs(tip).min(axis=0) <= margin).all())
 
 
-def _frozen(tip: FloatArray) -> BoolArray:
-    """Return which rows repeat the one before for longer than others do by chance."""
+def _repeated(tip: FloatArray) -> tuple[BoolArray, bool]:
+    """Return which rows repeat the one before by no chance, and whether most rows do."""
     noise = np.sqrt(0.5 * np.mean(np.diff(tip, axis=0) ** 2, axis=0))
     if (_steps(tip) > _COARSE * noise).all():
-        return np.zeros(len(tip), dtype=np.bool_)
+        return np.zeros(len(tip), dtype=np.bool_), False
     starts = np.flatnonzero(np.append(True, (tip[1:] != tip[:-1]).any(axis=1)))
     lengths = np.diff(starts, append=len(tip))
-    # A log at a higher rate than that of the sensor repeats every position.
-    usual = int(np.median(lengths))
-    count = np.count_nonzero(lengths > usual)
-    # A run of more than j times the usual length has the probability longer**j, by chance.
-    longer = min((count + 2.0 * sqrt(count) + 1.0) / len(lengths), 0.9)
-    limit = usual * ceil(_LIKELY * log(_RARE / len(lengths)) / log(longer))
     within = np.arange(len(tip)) - np.repeat(starts, lengths)
-    return np.asarray((np.repeat(lengths, lengths) > limit) & (within >= usual))
+    count = np.count_nonzero(lengths > 1)
+    # A log at a higher rate than that of the sensor.
+    if count >= _HELD * len(lengths):
+        return np.asarray(within > 0), True
+    # A run of more than j rows has the probability longer**j, by chance.
+    longer = min((count + 2.0 * sqrt(count) + 1.0) / len(lengths), 0.9)
+    limit = ceil(_LIKELY * log(_RARE / len(lengths)) / log(longer))
+    return np.asarray((np.repeat(lengths, lengths) > limit) & (within > 0)), False
 
 
 def _steps(tip: FloatArray) -> FloatArray:

@@ -140,7 +140,29 @@ def test_lost_tracking_is_as_missing_samples(kind: str) -> None:
     assert found.warnings == (f'160 positions are {kind}, in 4 places: counted as lost',)
 
 
-@pytest.mark.parametrize('every', [1.0, 1.5, 2.5])
+@pytest.mark.parametrize('times', [2.0, 2.5, 3.0])
+def test_a_log_at_a_higher_rate_is_one_at_the_rate_of_the_sensor(times: float) -> None:
+    """The first row of each position counts, to the bit; lost ones remain lost."""
+    clean = recorded(noise=1.8e-4, dropout=0.1, dropout_time=0.3)
+    tip = clean.tip.copy()
+    tip[400:440] = 0.0
+    first = np.ceil(times * np.arange(len(tip))).astype(np.int64)
+    last = np.append(first[1:], first[-1] + 1)
+    # The log continues while tracking is lost; its rows have the time of the sensor.
+    place = np.repeat(np.arange(len(tip)), last - first)
+    within = np.arange(len(place)) - np.repeat(first, last - first)
+    time = clean.time[place] + within / (times * RATE)
+    log = identify_sensor(replace(clean, time=time, tip=tip[place]))
+    own = identify_sensor(changed(clean, tip))
+    assert log.parameters == own.parameters
+    count = np.count_nonzero(within) - np.count_nonzero(within[tip[place, 0] == 0.0])
+    zeros = np.count_nonzero(tip[place, 0] == 0.0)
+    words = 'left out, as of a log at a higher rate than that of the sensor'
+    assert log.warnings[0] == f'{zeros} positions are zero, in 1 places: counted as lost'
+    assert re.fullmatch(f'{count} positions are .* as the one before, .*{words}', log.warnings[1])
+
+
+@pytest.mark.parametrize('every', [1.0, 1.5])
 @pytest.mark.parametrize('step', [1e-9, 1e-4, 2e-4, 3e-4, 1e-3])
 def test_positions_that_repeat_by_chance_are_measurements(step: float, every: float) -> None:
     """Those of a coarse sensor, about zero or elsewhere, and of a log at a higher rate."""
