@@ -33,6 +33,12 @@ EXAMPLES: Final = {unit: example.split()[-1] for unit, (_, example, _) in _KINDS
 TARGET_HELP: Final = 'x,y,z, where y is the depth, such as 4mm,100mm,-2mm; m without a unit'
 
 AXES: Final = ('x', 'y', 'z')  #: Axes of a frame, in the order of message fields.
+#: Orders and signs of two axes, the right one first. In complex numbers, x + i z, they are turns
+#: by a multiple of a quarter: alone, then after a reflection.
+SIGNED_PAIRS: Final = (
+    ('x', 'z'), ('-z', 'x'), ('-x', '-z'), ('z', '-x'),
+    ('x', '-z'), ('z', 'x'), ('-x', 'z'), ('-z', '-x'),
+)  # fmt: skip
 
 NORMAL: Final = 1.96  #: Half width of a 95 % interval of a normal quantity [standard deviations].
 

@@ -27,13 +27,10 @@ from typing import Final
 from needle_controller.steering.law import SteeringFaultError
 from needle_controller.steering.responses import BEVEL, DRIFT_LENGTH, SteeringModel
 from needle_dynamics.arrays import ComplexArray, FloatArray
+from needle_ros.quantities import SIGNED_PAIRS
 import numpy as np
 
-#: What the sensor measures as x and z in each case.
-_CASES: Final = (
-    ('x', 'z'), ('-z', 'x'), ('-x', '-z'), ('z', '-x'),
-    ('x', '-z'), ('z', 'x'), ('-x', 'z'), ('-z', '-x'),
-)  # fmt: skip
+#: Factors of `SIGNED_PAIRS`.
 _TURNS: Final = np.array([1.0, 1.0j, -1.0, -1.0j])
 
 #: Logarithm of the likelihood ratio of a case to the right axes that stops the needle: half more
@@ -78,12 +75,12 @@ class SensorAxes:
         self._squares += abs(seen) ** 2 + np.abs(shift) ** 2
         self._products += seen * np.array([shift.conj(), shift])
         gained = 2.0 * np.real(_TURNS.conj()[:, np.newaxis] * self._products[:, np.newaxis])
-        rest = np.maximum(self._squares - gained, 0.0).reshape(len(_CASES), -1)
+        rest = np.maximum(self._squares - gained, 0.0).reshape(len(SIGNED_PAIRS), -1)
         logs = -0.5 * (2 * len(self._at) + _FREEDOM) * np.log1p(rest / _FREEDOM)
         evidence = np.logaddexp.reduce(logs, axis=1)
         case = int(evidence.argmax())
         if evidence[case] - evidence[0] > _STOP:
-            x, z = _CASES[case]
+            x, z = SIGNED_PAIRS[case]
             raise SteeringFaultError(
                 f'the tip responds to the guide as if the sensor measured {x} as x and {z} as z: '
                 'axes or signs of tip or guide are wrong'

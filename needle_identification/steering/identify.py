@@ -70,6 +70,7 @@ from needle_identification.steering.search import (
     Tips,
 )
 from needle_ros.errors import ParameterError
+from needle_ros.quantities import SIGNED_PAIRS
 from needle_ros.settings import check_choice
 import numpy as np
 from scipy.special import stdtrit
@@ -78,6 +79,7 @@ _WORSE: Final = 1.5  # smallest ratio of held-out errors and residuals that is r
 _LEAST: Final = 1e-4  # least weight of a ratio of variances, for intervals and predictions
 #: Path noise that is reported [rad^2/m]: the path turns by 2 degrees in 0.1 m.
 _WANDERS: Final = 0.01
+_BETTER: Final = 20.0  # gain of the deviance by other axes of the tip that is reported
 _ROTATED: Final = 0.06  # rotation between frames that is reported [rad]
 _LARGEST: Final = 0.5  # largest error of a drift constant that is determined [prior deviations]
 
@@ -297,8 +299,22 @@ def _estimate(ranked: Sequence[_Fit]) -> SteeringEstimate:
         order=search.tips.order,
         residuals=tuple(residuals),
         optima=len(first.optima),
-        warnings=tuple(_warnings(alike, min(rises), media)),
+        warnings=(*_warnings(alike, min(rises), media), *_axes(search)),
     )
+
+
+def _axes(search: Search) -> Iterator[str]:
+    """Warn if the needle explains other axes of the tip far better."""
+    tips = [search.tips.with_axes(x, z) for x, z in SIGNED_PAIRS]
+    others = [Search(one, search.terms, search.known) for one in tips]
+    for k, medium in enumerate(search.members):
+        least = [one.least(k) for one in others]
+        x, z = SIGNED_PAIRS[int(np.argmin(least))]
+        if least[0] - min(least) > _BETTER:
+            yield (
+                f'{medium or "these recordings"}: the guide explains the tip far better with {x} '
+                f'as x and {z} as z: axes of the tip or of the guide are exchanged or reversed'
+            )
 
 
 def _stiffness_ratio(nominal: float, variable: float) -> float:

@@ -2,7 +2,9 @@
 """Search for the lengths with the highest likelihood, their intervals, and predictions."""
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from functools import lru_cache
+from itertools import product
 from math import copysign, exp, inf, log, sqrt
 from typing import Final, NamedTuple
 
@@ -19,6 +21,7 @@ from needle_identification.steering.recording import (
     TipResponses,
     UNIFORM,
 )
+from needle_ros.quantities import signed
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import chdtri, stdtrit
@@ -66,6 +69,13 @@ class Tips:
         self.measured = [one.tip[known].T for one, known in pairs]  # (2, n) [m]
         self._insertions = [SimulatedCauses(one, order, layers.starts) for one in recordings]
         self.of = lru_cache(maxsize=8000)(self._responses)
+
+    def with_axes(self, x: str, z: str) -> 'Tips':
+        """Return the same recordings with these signed axes as x and z of the tip."""
+        pairs = [(sign, 'xz'.index(axis)) for sign, axis in map(signed, (x, z))]
+        found = copy(self)
+        found.measured = [np.array([s * tip[k] for s, k in pairs]) for tip in self.measured]
+        return found
 
     def _responses(self, at: int, *lengths: float) -> TipResponses:
         return self._insertions[at].responses(*lengths)
@@ -304,6 +314,15 @@ class Search:
             if all(np.abs(one.x - other.x).max() > _APART for other in found):
                 found.append(one)
         return found
+
+    def least(self, medium: int) -> float:
+        """Return the least deviance of a medium on a coarse grid."""
+        frees = _FREES[1::2] if self.known is None else [self.known]
+        points = product(frees, _LENGTHS[1::2], _SKINS[::2])
+        return min(
+            self._part(medium, free, length, skin, *self._deeper(length)).deviance
+            for free, length, skin in points
+        )
 
     def _starts(self) -> list[FloatArray]:
         starts = []

@@ -117,6 +117,25 @@ def test_indistinguishable_causes_of_drift_are_not_determined() -> None:
     assert gel['curvature_z'].error < 0.1
 
 
+@pytest.mark.parametrize(
+    ('axes', 'said'),
+    [
+        ([[1, 0], [0, 1]], ''),
+        ([[0, 1], [1, 0]], 'with z as x and x as z'),
+        ([[-1, 0], [0, 1]], 'with -x as x and z as z'),
+        # x is measured as z, and z as -x.
+        ([[0, -1], [1, 0]], 'with z as x and -x as z'),
+    ],
+)
+def test_exchanged_and_reversed_axes_are_named(axes: list[list[int]], said: str) -> None:
+    for seed in range(2):
+        made = [insertion(100 * seed + k, drawn(seed)) for k in range(3)]
+        turned = [replace(one, tip=one.tip @ np.transpose(axes)) for one in made]
+        words = [one for one in identify_steering(turned).warnings if 'guide explains' in one]
+        assert bool(words) == bool(said)
+        assert all(said in one for one in words)
+
+
 @pytest.mark.parametrize('seed', [10, 87])
 def test_bending_length_is_known_with_several_causes_of_drift(seed: int) -> None:
     """With a single cause for each fit, these intervals excluded the true value."""
