@@ -3,13 +3,13 @@
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 import sys
 
 from needle_insertion.commands.common import add_flag, print_result
 from needle_insertion.replay.rerun import Rerun, TOLERANCE, verify
-from needle_insertion.report.content import table
+from needle_insertion.report.content import short_names, table
 from needle_ros.errors import NeedleError, ParameterError, shown
 from needle_ros.timing import NANOSECONDS
 from tqdm import tqdm
@@ -41,15 +41,16 @@ def run(options: argparse.Namespace) -> int:
             tqdm.write(f'error: {error}', file=sys.stderr)
             bad = True
     if results or options.json:
-        text = '\n'.join([_table(results), *map(shown, _remarks(results))])
+        names = short_names([*{str(result.recorded.path) for result in results}])
+        text = '\n'.join([_table(results, names), *map(shown, _remarks(results, names))])
         print_result([one.document for one in results], text, as_json=options.json)
     return 2 if bad else int(any(result.verdict == 'differs' for result in results))
 
 
-def _table(results: Sequence[Rerun]) -> str:
+def _table(results: Sequence[Rerun], names: Mapping[str, str]) -> str:
     rows = []
     for result in results:
-        name = shown(result.recorded.path.name)
+        name = shown(names[str(result.recorded.path)])
         for topic, found in result.topics.items():
             worst = f'{found.largest_difference:.3g} {found.unit} ({found.quantity})'
             counts = str(found.compared), worst if found.quantity else '0', str(found.differing)
@@ -60,10 +61,10 @@ def _table(results: Sequence[Rerun]) -> str:
     )
 
 
-def _remarks(results: Sequence[Rerun]) -> Iterator[str]:
+def _remarks(results: Sequence[Rerun], names: Mapping[str, str]) -> Iterator[str]:
     shared: dict[str, dict[Path, str]] = {}
     for result in results:
-        name = result.recorded.path.name
+        name = names[str(result.recorded.path)]
         for note in result.notes:
             shared.setdefault(note, {})[result.recorded.path] = name
         if result.first is not None:
@@ -74,9 +75,9 @@ def _remarks(results: Sequence[Rerun]) -> Iterator[str]:
                 f'{at["topic"]} {at["quantity"]}: recorded {at["recorded"]!r}, computed '
                 f'{at["computed"]!r} {at["unit"]}; {result.reason}'
             )
-    for note, names in shared.items():
-        more = f' and {len(names) - 2} more' if len(names) > 2 else ''
-        yield f'{", ".join(list(names.values())[:2])}{more}: {note}'
+    for note, bags in shared.items():
+        more = f' and {len(bags) - 2} more' if len(bags) > 2 else ''
+        yield f'{", ".join(list(bags.values())[:2])}{more}: {note}'
     counts = Counter(result.verdict for result in results)
     total = ', '.join(f'{number} {verdict}' for verdict, number in sorted(counts.items()))
     yield f'{len(results)} runs: {total}'

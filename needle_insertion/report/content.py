@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO, StringIO
 from itertools import zip_longest
+from pathlib import Path
 import re
 from textwrap import fill, wrap
 from typing import Final, TYPE_CHECKING
@@ -56,6 +57,12 @@ def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
 
 def filled(text: str) -> str:
     return fill(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
+
+
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return names of recordings without their folders, unless they are ambiguous."""
+    short = [Path(name).name or name for name in names]
+    return dict(zip(names, short if len(set(short)) == len(names) else names, strict=True))
 
 
 def _joined(found: re.Match[str]) -> str:

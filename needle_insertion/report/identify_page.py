@@ -12,7 +12,7 @@ from needle_identification.estimation.estimate import between, measured, rounded
 from needle_identification.result import model_parameters
 from needle_insertion.report import identify_figures as figures
 from needle_insertion.report import identify_text as text
-from needle_insertion.report.content import Picture
+from needle_insertion.report.content import Picture, short_names
 from needle_insertion.report.origin import Origin
 from needle_insertion.report.page import write_page
 from needle_insertion.report.paper_tables import FORCE_LEVELS, TABLE_1, TABLE_2
@@ -30,7 +30,7 @@ _QUALITY_HEADS: Final = ('residual [mN]', 'R²', 'condition')
 def write_identified_page(folder: Path, summary: text.Summary, origin: Origin) -> Path:
     """Write ``friction.html`` or ``stiffness.html`` and its pictures; return the page."""
     estimates = summary.estimates
-    label = text.short_names([estimate.name for estimate in estimates])
+    label = short_names([estimate.name for estimate in estimates])
     short, full = text.warned(summary, origin)
     number = len(estimates)
     recordings = _counted(number, 'recording')

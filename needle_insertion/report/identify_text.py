@@ -4,7 +4,6 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from math import isfinite
-from pathlib import Path
 import re
 from typing import Any, Final, TypeAlias
 
@@ -19,7 +18,7 @@ from needle_identification import (
 from needle_identification.estimation.estimate import between, measured, spread, statistic
 from needle_identification.estimation.prediction import Moments
 from needle_identification.stiffness.presses import Presses
-from needle_insertion.report.content import table
+from needle_insertion.report.content import short_names, table
 from needle_insertion.report.origin import Origin
 import numpy as np
 
@@ -196,12 +195,6 @@ def _grouped(
         for same in groups.values()
     ]
     return short, [line for same in groups.values() for line in same]
-
-
-def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return names of recordings without their folders, unless they are ambiguous."""
-    short = [Path(name).name or name for name in names]
-    return dict(zip(names, short if len(set(short)) == len(names) else names, strict=True))
 
 
 def identified_document(summary: object, origin: Origin) -> dict[str, Any]:

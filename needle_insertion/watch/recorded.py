@@ -17,6 +17,7 @@ from needle_identification.bags.messages import deserialize
 from needle_identification.bags.topics import BagTopic
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.samples import are_gaps
+from needle_insertion.report.content import short_names
 from needle_insertion.watch.view import CONFIGURED, EFFORT, RATE, Signal, signal_of, SIGNALS, View
 from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
@@ -137,7 +138,7 @@ class ShownRecording:
     """
 
     def __init__(self, path: Path, time: str = TIMES[0]) -> None:
-        self.name = path.name or str(path)
+        self.path, self.name = path, path.name or str(path)
         self._header = time == TIMES[0]
         #: Messages by topic, and by line or node.
         self._kept: dict[tuple[str, str], _Kept] = {}
@@ -170,7 +171,7 @@ class ShownRecording:
         elapsed = (end - begin) / NANOSECONDS
         if self._header and self.duration > 2.0 * elapsed + _SLACK:
             contradiction = (
-                f'the stamps of {path.name} span {self.duration:.4g} s, and its messages arrived '
+                f'the stamps of {path} span {self.duration:.4g} s, and its messages arrived '
                 f'within {elapsed:.4g} s: use --time receive if clocks differed'
             )
             self.losses += (contradiction,)
@@ -274,6 +275,9 @@ def compare(
     first: ShownRecording, other: ShownRecording, shift: float | None = None
 ) -> Comparison:
     """Align another recording by a shift of its times [s], or at the start of motion."""
+    names = short_names([str(one.path) for one in (first, other)])
+    for one in (first, other):
+        one.name = names[str(one.path)]
     if shift is not None:
         return Comparison(other, shift, f'{other.name}: times shifted by {shift:+.3f} s')
     here, there = first.start_of_motion(), other.start_of_motion()

@@ -628,6 +628,19 @@ def test_unusable_bags_are_skipped(tmp_path: Path, capsys: pytest.CaptureFixture
     assert '1 runs: 1 identical' in captured.out
 
 
+def test_runs_of_sessions_have_different_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Their bags are all folders with the name `bag`."""
+    messages = [m for m in simulated() if m.topic != '/ground_truth']
+    bags = [str(written(tmp_path / name / 'bag', messages)) for name in 'ab']
+    assert main(['verify', *bags]) == 0
+    said = capsys.readouterr().out
+    rows = {line.split()[0] for line in said.splitlines() if line.endswith('identical')}
+    assert rows >= {*bags}
+    assert f'{bags[0]}, {bags[1]}: not in the bag: /ground_truth' in said
+
+
 def test_note_on_two_runs_names_their_bag_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -90,6 +90,15 @@ def test_compared_recordings_start_to_move_together(tmp_path: Path) -> None:
     assert (sent['begin'], sent['end']) == pytest.approx((1.1, 1.1 + other.duration))
 
 
+def test_compared_recordings_have_different_names(tmp_path: Path) -> None:
+    """Also sessions, whose bags are all folders with the name `bag`."""
+    first, other = (insertion(tmp_path / name / 'bag', 0.5) for name in 'ab')
+    found = compare(first, other)
+    assert (first.name, other.name) == (str(tmp_path / 'a/bag'), str(tmp_path / 'b/bag'))
+    assert found.words.startswith(f'{other.name}: times shifted by ')
+    assert compare(first, first).recording.name == first.name
+
+
 def test_recordings_are_aligned_by_a_stated_time(tmp_path: Path) -> None:
     """Also if the needle rests; without a time, the page states that they are not aligned."""
     first, still = insertion(tmp_path / 'a', 0.5), insertion(tmp_path / 'b', 0.5, speed=0.0)
