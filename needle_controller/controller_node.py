@@ -3,7 +3,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from math import nan
 import sys
 from time import sleep
@@ -31,7 +31,7 @@ from needle_ros.event_log import Severity
 from needle_ros.life_cycle_node import PreparationProgress
 from needle_ros.publishers_node import offer_lease, Publishers
 from needle_ros.run_node import run
-from needle_ros.settings import is_number
+from needle_ros.settings import CheckedSettings, constant
 from needle_ros.status import ControllerStatus, Diagnosis
 from needle_ros.system_state import RETRACT_DEPTH
 from needle_ros.system_state_node import SystemStateTopics
@@ -39,7 +39,6 @@ from needle_ros.timing import nanoseconds
 from needle_ros.trajectories import FollowedJoint, JointPath, JointReference
 from needle_ros.trajectory_action_node import TrajectoryAction
 from needle_ros.wire import Reading
-from rcl_interfaces.msg import ParameterDescriptor
 from trajectory_msgs.msg import JointTrajectory
 
 _RETRACT = 'retract_depth'
@@ -51,6 +50,11 @@ _AGAIN, _PAUSE = 5, 0.02
 _PATIENCE = 20  #: Checks without joint states before a warning is logged.
 _GUIDE = {joint.name for joint in contract.STEERING_JOINTS}  #: Joints that no axis law controls.
 FEEDBACKS = ('observer', 'ground_truth', 'none')  #: Sources of the load of the bent needle.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Withdrawal(CheckedSettings):
+    retract_depth: float = constant(RETRACT_DEPTH, 'm', 'insertion depth of ~/retract')
 
 
 class ControllerNode(ModelNode):
@@ -110,15 +114,7 @@ class ControllerNode(ModelNode):
             False,
             'targets are executed by the node steering: only trajectories are followed',
         )
-        self.declare_parameter(
-            _RETRACT,
-            RETRACT_DEPTH,
-            ParameterDescriptor(
-                description='insertion depth of ~/retract [m]',
-                dynamic_typing=True,
-                additional_constraints='a number',
-            ),
-        )
+        self.declare_settings('', _Withdrawal())
         self.declare_settings('', ControllerSettings())
         self.declare_settings('reference.', ReferenceLimits())
         self.declare_settings('safety.', SafetyLimits())
@@ -231,14 +227,14 @@ class ControllerNode(ModelNode):
         return gains
 
     def _retract_depth(self, changes: Mapping[str, Any]) -> float:
-        value = changes.get(_RETRACT, self.get_parameter(_RETRACT).value)
+        value = self.settings('', _Withdrawal, changes).retract_depth
         low, high = self.settings('', ControllerSettings).depths(self.model_parameters())
         if _RETRACT not in changes and value == RETRACT_DEPTH:
             # The default is limited to the range of the needle.
             return min(max(RETRACT_DEPTH, low), high)
-        if not is_number(value) or not low <= value <= high:
+        if not low <= value <= high:
             raise ParameterError(f'{_RETRACT} must be in [{low:g}, {high:g}] m, got {value!r}')
-        return float(value)
+        return value
 
     def check_before(self, changes: Mapping[str, Any]) -> Callable[[], object] | None:
         """Check the stability in a thread: unstable gains take up to seconds."""

@@ -348,7 +348,12 @@ class Loop:
     """
 
     def __init__(
-        self, graph: RosGraph, *, rate: float = 200.0, depth: float = 0.02, **parameters: float
+        self,
+        graph: RosGraph,
+        *,
+        rate: float = 200.0,
+        depth: float = 0.02,
+        **parameters: float | str,
     ) -> None:
         self.graph = graph
         self.probe = graph.node('probe')
@@ -425,7 +430,7 @@ def path(*points: tuple[float, float, None], joint: str = 'insertion') -> JointT
 @pytest.mark.requirement('S-008')
 def test_pause_resume_and_retract(ros_graph: RosGraph) -> None:
     """The reference brakes, holds, continues to its target, and retracts."""
-    loop = Loop(ros_graph, retract_depth=0.019)
+    loop = Loop(ros_graph, retract_depth='19mm')
     loop.aim(0.1)
     loop.until(lambda: loop.speed() == 0.01, 'the highest speed')
     assert loop.call(SetBool, 'pause', SetBool.Request(data=True)).success
@@ -507,6 +512,8 @@ def test_bumpless_transfer_of_law_and_gains(ros_graph: RosGraph) -> None:
         ('pid.insertion.kp', [1.0, 2.0], 'must be a number'),
         ('law', 'bang_bang', 'law must be one of adaptive, inverse_dynamics, pid'),
         ('retract_depth', 0.5, 'retract_depth must be in [0.001, 0.2] m'),
+        ('retract_depth', '300mm', 'retract_depth must be in [0.001, 0.2] m, got 0.3'),
+        ('retract_depth', '20N', 'retract_depth must be a number, or text with a unit of m, cm'),
     ],
 )
 def test_invalid_gains_are_rejected_while_active(

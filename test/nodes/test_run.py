@@ -110,7 +110,7 @@ def test_script_inserts_changes_the_law_and_retracts(ros_graph: RosGraph, tmp_pa
         tmp_path / 'run',
         [
             '# a comment',
-            'set controller retract_depth 0.02',
+            'set controller retract_depth 20mm',
             'target 23mm',
             'wait 60',
             'pause',
