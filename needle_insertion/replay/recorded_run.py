@@ -74,9 +74,10 @@ def recorded_runs(path: Path) -> list[RecordedRun]:
         if name.endswith('/configuration') and _configurations(found)
     ]
     if not runs:
-        raise RecordingError(
-            f'{path} holds no parameters of a plant; record /plant/configuration with the rest'
-        )
+        # Raises the error of a bag without messages.
+        bag.topics()
+        lacking = 'holds no parameters of a plant; record /plant/configuration with the rest'
+        raise RecordingError('; '.join([f'{path} {lacking}', *losses]))
     return runs
 
 

@@ -619,11 +619,17 @@ def test_unusable_bags_are_a_one_line_error(
 def test_unusable_bags_are_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Missing and damaged bags are reported; the usable bag has its row."""
     (tmp_path / 'bad.mcap').write_bytes(b'nothing of the kind')
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'empty/empty_0.mcap').touch()
     good = written(tmp_path / 'good', simulated())
-    bags = [str(tmp_path / 'none'), str(tmp_path / 'bad.mcap'), str(good)]
+    bags = [*map(str, (tmp_path / 'none', tmp_path / 'bad.mcap', tmp_path / 'empty', good))]
     assert main(['verify', *bags]) == 2
     captured = capsys.readouterr()
-    assert [line.split(':')[0] for line in captured.err.splitlines()] == ['error', 'error']
+    lines = captured.err.splitlines()
+    assert [line.split(':')[0] for line in lines] == ['error'] * 3
+    for line in lines[1:]:
+        assert 'holds no messages; ' in line
+        assert 'is not an MCAP file' in line
     assert 'none does not exist' in captured.err
     assert '1 runs: 1 identical' in captured.out
 
