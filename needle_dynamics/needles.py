@@ -183,6 +183,11 @@ def _based(name: str, document: object) -> NeedlePreset:
             for key, value in found.items()
             if key == 'needle' or key.startswith(_PREFIXES)
         }
+        if not values:
+            raise ParameterError(
+                f'{name} must have constants {" or ".join(f"{one}*" for one in _PREFIXES)}, got '
+                f'{", ".join(found)}'
+            )
     base = str(values.pop('needle', DEFAULT_NEEDLE))
     if base not in NEEDLES or not values:
         raise ParameterError(

@@ -93,6 +93,10 @@ def test_parameter_file_of_nodes_is_a_needle(tmp_path: Path) -> None:
         ('outer_diameter: 1mm\narea: 1mm^2\n', 'area is given by the diameters, too'),
         ('outer_diamter: 1mm\n', "did you mean 'outer_diameter'"),
         ('a: [', 'mine.yaml is not YAML'),
+        (
+            '/**/plant:\n  ros__parameters:\n    tip.noise: 0.001\n    tip.rate: 40\n',
+            'must have constants model.* or steering.*, got tip.noise, tip.rate',
+        ),
     ],
 )
 def test_errors_of_a_file_name_the_file(tmp_path: Path, text: str, complaint: str) -> None:
