@@ -20,10 +20,6 @@ DEFAULT_AXIS_STEP = 1e-4  #: default step along the axis [s]
 
 
 def axis_of(needle: NeedleParameters, steering: SteeringParameters) -> AxisConstants:
-    if needle.friction_law != 'coulomb':
-        raise ParameterError(
-            f'friction_law must be coulomb for a steered needle, got {needle.friction_law!r}'
-        )
     if not needle.hub_stop:
         raise ParameterError(
             'hub_stop must be true: the hub of a steered needle stops on the guide'

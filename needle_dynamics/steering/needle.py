@@ -72,6 +72,10 @@ def steered(
     """Return constants for compiled functions; ``wander`` (cells, 2) is of `wandering` [N]."""
     tissue = needle.tissue
     longest_insertion(needle, steering)
+    if needle.friction_law != 'coulomb':
+        raise ParameterError(
+            f'friction_law must be coulomb for a steered needle, got {needle.friction_law!r}'
+        )
     if needle.swelling != 0.0:
         raise ParameterError(f'swelling must be 0 for a steered needle, got {needle.swelling:g}')
     return Steered(

@@ -16,6 +16,7 @@ from needle_dynamics import (
     NeedleModel,
     NeedleParameters,
     ParameterError,
+    SteeredNeedle,
     SteeringParameters,
 )
 import numpy as np
@@ -219,13 +220,15 @@ def test_invalid_inputs_are_rejected(values: dict[str, Any], words: str) -> None
 
 
 def test_invalid_constants_are_rejected() -> None:
+    with pytest.raises(ParameterError, match='hub_stop must be true'):
+        Insertion(replace(NEEDLE, hub_stop=False), STEERING)
     for needle, words in (
         (replace(NEEDLE, friction_law='tanh'), "friction_law must be coulomb .* got 'tanh'"),
         (replace(NEEDLE, swelling=0.1), 'swelling must be 0'),
-        (replace(NEEDLE, hub_stop=False), 'hub_stop must be true'),
     ):
-        with pytest.raises(ParameterError, match=words):
-            Insertion(needle, STEERING)
+        for kind in (SteeredNeedle, Insertion):
+            with pytest.raises(ParameterError, match=words):
+                kind(needle, STEERING)
     with pytest.raises(ParameterError, match='cutting_force must have one value, or one for each'):
         Insertion(NEEDLE, replace(STEERING, cutting_force=(1.0, 2.0, 3.0)))
     with pytest.raises(ParameterError, match='membrane_strengths must have one value for each'):
