@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of recordings and of identification."""
 
-from needle_ros.errors import NeedleError
+from needle_ros.errors import NeedleError, shown
 
 
 class RecordingError(NeedleError):
@@ -14,3 +14,11 @@ class IdentificationError(NeedleError):
 
 class WrongSignError(IdentificationError):
     """A constant that cannot be negative is clearly negative."""
+
+
+class UnknownNameError(NeedleError, KeyError):
+    """A result or a table has no item with this name."""
+
+    def __str__(self) -> str:
+        # A KeyError quotes its message.
+        return shown(self.args[0])

@@ -22,7 +22,7 @@ from needle_identification.bags.mcap_file import (
 )
 from needle_identification.bags.sqlite_file import sqlite_batches
 from needle_identification.bags.topics import BagTopic, MessageBatch, Tally
-from needle_identification.errors import RecordingError
+from needle_identification.errors import RecordingError, UnknownNameError
 from needle_ros.errors import printable
 from needle_ros.files import DocumentError, LARGEST, read_document
 from needle_ros.timing import NANOSECONDS
@@ -337,7 +337,7 @@ class TopicTable(Displayed):
         try:
             return self.values[name]
         except KeyError:
-            raise KeyError(f'{name!r}; valid: {", ".join(self.values)}') from None
+            raise UnknownNameError(f'{name!r}; valid: {", ".join(self.values)}') from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.values)

@@ -10,7 +10,7 @@ from math import floor, inf, isfinite, log10, nan, sqrt
 from typing import Any, Final, TYPE_CHECKING, TypeAlias, TypeVar
 
 from needle_dynamics.display import Displayed, new_figure
-from needle_identification.errors import IdentificationError, WrongSignError
+from needle_identification.errors import IdentificationError, UnknownNameError, WrongSignError
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
@@ -130,11 +130,11 @@ _Named = TypeVar('_Named', ParameterEstimate, Statistic)
 
 
 def named(items: Sequence[_Named], name: str) -> _Named:
-    """Return the item with a name; a KeyError lists the valid names."""
+    """Return the item with a name; an `UnknownNameError` lists the valid names."""
     for item in items:
         if item.name == name:
             return item
-    raise KeyError(f'{name!r}; valid: {", ".join(item.name for item in items)}')
+    raise UnknownNameError(f'{name!r}; valid: {", ".join(item.name for item in items)}')
 
 
 def statistic(parameters: Sequence[ParameterEstimate]) -> Statistic:

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.parameters import NeedleParameters
+from needle_identification.errors import UnknownNameError
 from needle_identification.estimation.estimate import (
     DisplayedEstimate,
     EstimateRows,
@@ -93,7 +94,8 @@ class SteeringEstimate(DisplayedEstimate):
         for one in self.media:
             if one.medium == medium:
                 return one
-        raise KeyError(f'{medium!r}; valid: {", ".join(one.medium for one in self.media)}')
+        valid = ', '.join(one.medium for one in self.media)
+        raise UnknownNameError(f'{medium!r}; valid: {valid}')
 
     def rows(self) -> EstimateRows:
         media = (medium.rows() for medium in self.media)
