@@ -65,7 +65,7 @@ WORDS: Final = {
     'target': ('DEPTH | X,Y,Z', f'insert to a depth, 50mm, or steer the tip to {TARGET_HELP}'),
     'wait': (
         '[TIME]',
-        'wait until the needle is at its target, at most 20s; the next line ends it',
+        'wait until the needle is at its target, or for a time such as 20s; the next line ends it',
     ),
     'pause': ('', 'brake to rest and hold'),
     'resume': ('', 'continue after a pause'),
