@@ -77,7 +77,8 @@ class Session:
         self._target = target
         self._node, self.screen = graph.node('operator'), Screen()
         self._check_alone(own=0, discovery=1.0)
-        self._operator, self._warnings = Operator(self._node), Warnings(self.screen.say)
+        self._operator = Operator(self._node)
+        self._warnings = Warnings(self.screen.say, robot='plant' not in nodes)
 
     def run(self) -> None:
         """Start the nodes, execute the commands of a person or a script, and end the nodes."""

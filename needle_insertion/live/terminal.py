@@ -82,14 +82,16 @@ WORDS: Final = {
 #: Period of the checks of a condition [s]. After each event of /clock, messages would be too late.
 _PERIOD: Final = 0.02
 
-_GRACE: Final = 5.0  #: Time at the start in which nodes wait for each other [s].
+#: Time at the start in which nodes wait for a robot, without a warning [s].
+_GRACE: Final = 5.0
 
 
 class Warnings:
-    """Print new warnings and errors of nodes; at first they wait for each other."""
+    """Print new warnings and errors of nodes; at first they wait for a plant or a robot."""
 
-    def __init__(self, say: Callable[[str], object]) -> None:
-        self._say, self.quiet = say, monotonic() + _GRACE
+    def __init__(self, say: Callable[[str], object], *, robot: bool) -> None:
+        # Without a robot the session waits for all nodes before the first command.
+        self._say, self.quiet = say, monotonic() + _GRACE if robot else inf
         #: Latest message of each node without its numbers, and when it was printed.
         self._last: dict[str, str] = {}
         self._printed: dict[tuple[str, str], float] = {}
@@ -133,9 +135,11 @@ class Terminal(Cmd):
         self._steers = False
 
     def begin(self, nodes: Collection[str]) -> None:
-        """Wait for states and measurements of the nodes: earlier requests would be rejected."""
+        """Wait for states and measurements of active nodes: earlier requests would be rejected."""
+        active = monotonic()
         for name in nodes:
-            self._state(name)
+            # An earlier state may be that of a node that was not active yet.
+            self._state(name, since=active)
         for name, topic in _NEEDED:
             if name in nodes:
                 accepted = partial(self._has_accepted, name, topic)
@@ -323,10 +327,14 @@ class Terminal(Cmd):
         rows = [(name, one.report.level_name, one.report.message) for name, one in states]
         self._say(f'{self._readings.line()}\n{table(rows, ("node", "level", "state"))}')
 
-    def _state(self, node: str) -> State:
-        """Return the latest status of a node; wait for the first."""
+    def _state(self, node: str, since: float = -inf) -> State:
+        """Return the latest status of a node; wait for the first one after a time [s]."""
         states = self._operator.states
-        self._spin_until(lambda: node in states, f'the node {node}', _ANSWER)
+
+        def told() -> bool:
+            return node in states and states[node].received > since
+
+        self._spin_until(told, f'the node {node}', _ANSWER)
         return states[node]
 
     def _answered(self, future: Future, what: str) -> None:

@@ -19,6 +19,7 @@ import time
 from needle_controller.steering.insertion_plan import write_plan
 from needle_dynamics.plant_node import PlantNode
 from needle_identification.bags.bag import read_topic
+from needle_insertion.graph.messages import State
 from needle_insertion.graph.ros_graph import Graph
 from needle_insertion.live.operator import Operator
 from needle_insertion.live.readings import Readings
@@ -26,6 +27,7 @@ from needle_insertion.live.screen import Screen
 from needle_insertion.live.terminal import Terminal, Warnings
 from needle_insertion.replay.rerun import verify
 from needle_ros.base_node import SENSOR
+from needle_ros.status import LEVELS, NodeReport
 import pytest
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -173,6 +175,29 @@ def test_session_of_the_readme_is_reproduced(ros_graph: RosGraph, tmp_path: Path
         for lines in (shown, printed)
     )
     assert here == pytest.approx(there, abs=2**0.5 * 0.09)
+
+
+def test_first_status_is_of_active_nodes(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Without warnings of nodes that wait for each other at the start."""
+    status, said, complained = told(ros_graph, tmp_path / 'run', ['status'])
+    assert (status, complained) == (0, '')
+    assert re.search(r'^plant +OK +active$', said, re.MULTILINE), said
+    assert 'not active' not in said
+    assert 'no joint_states yet' not in said
+
+
+def test_warnings_of_nodes_that_wait_are_kept_for_the_session() -> None:
+    """With a plant, which starts last, they are printed once if they last beyond the start."""
+    lines = list[str]()
+    report = NodeReport('/controller', LEVELS.index('WARN'), 'no joint_states yet', {})
+    states = {'controller': State(report, time.monotonic())}
+    warnings = Warnings(lines.append, robot=False)
+    warnings.show(states)
+    assert lines == []
+    warnings.quiet = 0.0
+    for _ in range(2):
+        warnings.show(states)
+    assert lines == ['controller: WARN no joint_states yet']
 
 
 def test_script_ends_at_a_rejected_target(ros_graph: RosGraph, tmp_path: Path) -> None:
@@ -535,7 +560,8 @@ def test_status_does_not_wait_for_a_check_after_each_message(tmp_path: Path) -> 
         node.create_subscription(Header, 'status', status.append, qos)
         fast, late = (node.create_publisher(Header, name, qos) for name in ('fast', 'status'))
         readings, screen = Readings(Node('readings', context=graph.context)), Screen()
-        terminal = Terminal(graph, Operator(node), readings, screen, Warnings(screen.say))
+        warnings = Warnings(screen.say, robot=False)
+        terminal = Terminal(graph, Operator(node), readings, screen, warnings)
         # The executor must have installed its listeners: each message is an event of its own.
         graph.executor.spin_once(timeout_sec=0.1)
         for _ in range(count):
