@@ -104,17 +104,17 @@ class NodeProcess:
         if status is not None and not self.ended:
             self.ended = True
             if status == INVALID_INPUT:
-                line = _LOG_PREFIX.sub('', self.last_line)
-                raise InvalidNodeError(f'{self.name}: {line or "invalid parameters"}')
+                raise InvalidNodeError(f'{self.name}: {self.last_line or "invalid parameters"}')
             raise GraphError(
                 f'{self.name} ended early with status {status}: {self.last_line or "no output"}'
             )
 
     @property
     def last_line(self) -> str:
+        """Last line of output, without time and name of the node."""
         self._log.flush()
         lines = Path(self._log.name).read_text(encoding='utf-8', errors='replace').splitlines()
-        return lines[-1] if lines else ''
+        return _LOG_PREFIX.sub('', lines[-1]) if lines else ''
 
     def kill(self) -> None:
         self.ended = True

@@ -213,6 +213,15 @@ def test_script_ends_at_a_rejected_target(ros_graph: RosGraph, tmp_path: Path) -
     assert not (tmp_path / 'run' / 'bag').exists()
 
 
+def test_node_that_cannot_start_is_a_line(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Without time and severity of its log."""
+    status, _, complained = told(ros_graph, tmp_path / 'run', ['status'], '-p', 'plant.depth=5')
+    assert status == 1
+    assert re.fullmatch(
+        'error: plant failed to start: insertion depth 5 m is outside .*\n', complained
+    )
+
+
 def test_robot_replaces_the_plant(ros_graph: RosGraph, tmp_path: Path) -> None:
     ros_graph.add(PlantNode, parameters={'rate': 200.0, 'depth': 0.02})
     status, said, complained = told(
