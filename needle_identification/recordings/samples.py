@@ -325,7 +325,8 @@ class Gathering:
         self._fault = self._fault or decoded.fault
         stamps = received = batch.received[decoded.used]
         if self._by_header:
-            stamped = decoded.stamps != 0
+            # A simulation may begin at the time 0.
+            stamped = (decoded.stamps != 0) | (received == 0)
             self._unstamped += int(np.count_nonzero(~stamped))
             stamps = np.where(stamped, decoded.stamps, received)
         with np.errstate(all='ignore'):

@@ -224,6 +224,17 @@ def test_without_header_stamps_the_receive_time_is_used(tmp_path: Path) -> None:
     )
 
 
+def test_stamp_of_a_simulation_that_begins_at_zero_is_a_stamp(tmp_path: Path) -> None:
+    """Its receive time is 0, too."""
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.add_topic('/ft', WRENCH)
+        writer.add_topic('/joints', MOTION)
+        for stamp in range(0, 10**8, 10**7):
+            writer.write('/ft', wrench(stamp, 1.0), stamp)
+            writer.write('/joints', joint_states(stamp, 0.1, 0.0), stamp)
+    assert read_friction_recording(tmp_path / 'bag').losses == ()
+
+
 def test_one_sample_is_not_a_recording(tmp_path: Path) -> None:
     path = small_bag(tmp_path / 'bag', [(0, 1.0)], grid()[1])
     with pytest.raises(
