@@ -22,7 +22,9 @@ _OUTPUT: Final = Path('reproduce_output')  #: Default folder of the page of all 
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('what', choices=RESULTS)
+    parser.add_argument(
+        'what', choices=RESULTS, metavar='WHAT', help=f'one of {", ".join(RESULTS)}'
+    )
     parser.add_argument(
         '-o',
         '--output',

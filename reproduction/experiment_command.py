@@ -11,7 +11,10 @@ from reproduction.protocol import FASTEST, PROTOCOLS, SPEED
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        'which', choices=tuple(PROTOCOLS), help='quantity to identify from the recordings'
+        'which',
+        choices=tuple(PROTOCOLS),
+        metavar='WHAT',
+        help=f'quantity to identify from the recordings: {" or ".join(PROTOCOLS)}',
     )
     parser.add_argument('output', type=Path, metavar='DIR', help='folder for the bags')
     for name, kind, default, unit, words in (

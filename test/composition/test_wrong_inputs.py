@@ -87,6 +87,8 @@ ANSWERS = {
     'experiment stiffness --needle phantom out': '--needle is for friction',
     'experiment friction --needle fantom out': 'did you mean phantom?',
     'experiment friktion out': 'did you mean friction?',
+    'experiment exp2 friction': "argument WHAT: invalid choice: 'exp2' (choose from 'friction'",
+    'reproduce tables': "argument WHAT: invalid choice: 'tables' (choose from 'figure-4'",
     'reproduce figure-9': 'did you mean figure-8?',
     'run --needle bending_35mmm': 'did you mean bending_35mm?',
     'run --hardwre': 'did you mean --hardware?',
