@@ -38,10 +38,8 @@ _FORMS: Final = ('.mcap', '.db3', '.bag')
 MATLAB: Final = '.mat'
 TABLES: Final = ('.csv', '.tsv', '.txt', '.dat', MATLAB)
 
-_VALID: Final = (
-    'valid: a rosbag2 folder, an .mcap or a .db3 file, or a .bag file of ROS 1; for friction, '
-    f'steering and sensor also a table ({", ".join(TABLES)})'
-)
+_BAGS: Final = 'valid: a rosbag2 folder, an .mcap or a .db3 file, or a .bag file of ROS 1'
+_VALID: Final = f'{_BAGS}; for friction, steering and sensor also a table ({", ".join(TABLES)})'
 
 _PAUSE: Final = NANOSECONDS  # between parts of one recording, this long or longer [ns]
 
@@ -63,11 +61,13 @@ def _uncompressed(file: Path) -> Path:
 
 def files_of(path: Path) -> tuple[list[Path], list[str]]:
     """List the files of a bag in the order of recording, and its missing or foreign files."""
+    # A table comes here from a reader of bags only.
+    valid = _BAGS if path.suffix.lower() in TABLES else _VALID
     if not path.exists():
-        raise RecordingError(f'{path} does not exist; {_VALID}')
+        raise RecordingError(f'{path} does not exist; {valid}')
     if path.is_file():
         if not form_of(path):
-            raise RecordingError(f'{path} is not a recording; {_VALID}')
+            raise RecordingError(f'{path} is not a recording; {valid}')
         return [path], []
     inside = path.iterdir() if path.is_dir() else ()
     found = _in_order(filter(Path.is_file, inside))

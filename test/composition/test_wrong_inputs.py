@@ -143,6 +143,16 @@ def test_wrong_input_is_answered_in_one_line(
     assert sorted(wrong.rglob('*')) == before
 
 
+@pytest.mark.parametrize('command', ['verify', 'watch', 'identify stiffness'])
+def test_command_that_reads_no_tables_lists_none(
+    command: str, wrong: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(wrong)
+    only = answer(f'{command} table.csv', capsys)
+    assert only.endswith('table.csv is not a recording; valid: a rosbag2 folder, an .mcap or a '
+                         '.db3 file, or a .bag file of ROS 1')  # fmt: skip
+
+
 def test_missing_extra_is_named(
     wrong: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
