@@ -355,8 +355,8 @@ def read_bag(path: Path | str, topic: str) -> TopicTable:
     Read one topic of a bag as arrays, of any message type that ROS 2 Jazzy or the bag defines.
 
     Elements of sequences are columns, such as ``data[0]``, and ``position.insertion`` if the
-    message names them. A missing number is NaN. Sequences with more than 64 elements, such as
-    images, are arrays in one column.
+    message names them. Times are integers in ns, such as ``header.stamp [ns]``. A missing number
+    is NaN. Sequences with more than 64 elements, such as images, are arrays in one column.
 
     Parameters
     ----------
@@ -383,7 +383,7 @@ def read_bag(path: Path | str, topic: str) -> TopicTable:
     rows = [dict(_leaves('', message)) for _, message in messages]
     names = dict.fromkeys(key for row in rows for key in row)
     found = {key: _column([row.get(key) for row in rows]) for key in names}
-    stamps = found.get('header.stamp', received)
+    stamps = found.get('header.stamp [ns]', received)
     if not stamps.any():
         # The driver does not stamp. Simulated time begins at zero.
         stamps = received
@@ -396,7 +396,7 @@ def _leaves(name: str, value: Any, labels: Sequence[str] = ()) -> Iterator[tuple
     if is_dataclass(value):
         parts = {p.name: getattr(value, p.name) for p in fields(value) if p.name != '__msgtype__'}
         if [*parts] == ['sec', 'nanosec']:
-            yield name, parts['sec'] * NANOSECONDS + parts['nanosec']
+            yield f'{name} [ns]'.lstrip(), parts['sec'] * NANOSECONDS + parts['nanosec']
             return
         found = next((part for part in _LABELS if isinstance(parts.get(part), list)), '')
         for part, inner in parts.items():

@@ -33,6 +33,7 @@ def test_named_joints_are_columns() -> None:
         table['position.insertion'], [one.position[joint] for one in messages]
     )
     stamps = np.array([s.sec * 10**9 + s.nanosec for s in (m.header.stamp for m in messages)])
+    np.testing.assert_array_equal(table['header.stamp [ns]'], stamps)
     np.testing.assert_allclose(table['time [s]'], (stamps - stamps[0]) / 1e9, rtol=0, atol=1e-9)
     assert table.topic == f'/{JOINT_STATES.name}'
     assert not [name for name in table.values if '__' in name]
