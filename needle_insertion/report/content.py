@@ -12,6 +12,7 @@ from io import BytesIO, StringIO
 from itertools import zip_longest
 from pathlib import Path
 import re
+from shutil import get_terminal_size
 from textwrap import fill, wrap
 from typing import Final, TYPE_CHECKING
 
@@ -31,15 +32,16 @@ _NEVER: Final = re.compile('(?!)')
 
 
 def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
-    """Return rows as aligned text; cells of tables wider than 100 columns are wrapped."""
+    """Return rows as aligned text; cells are wrapped beyond 100 columns or the terminal."""
+    limit = _limit()
     # Avoid breaks in numbers and in the first column if the width permits.
     for first, inside in ((_SPACE, _TOGETHER), (_SPACE, _NEVER), (_NEVER, _NEVER)):
         cells = [
             [first.sub(_joined, name), *(inside.sub(_joined, cell) for cell in others)]
             for name, *others in (heads, *rows)
         ]
-        widths = _widths(cells)
-        if _total(widths) <= _WIDTH:
+        widths = _widths(cells, limit)
+        if _total(widths) <= limit:
             break
     lines: list[tuple[str, ...]] = []
     for row in cells:
@@ -56,7 +58,7 @@ def table(rows: Sequence[Sequence[str]], heads: Sequence[str]) -> str:
 
 
 def filled(text: str) -> str:
-    return fill(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
+    return fill(text, _limit(), break_long_words=False, break_on_hyphens=False)
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
@@ -69,12 +71,16 @@ def _joined(found: re.Match[str]) -> str:
     return found[0].replace(' ', '\xa0')
 
 
-def _widths(cells: Sequence[Sequence[str]]) -> list[int]:
+def _limit() -> int:
+    return min(_WIDTH, get_terminal_size((_WIDTH, 1)).columns)
+
+
+def _widths(cells: Sequence[Sequence[str]], limit: int) -> list[int]:
     """Return column widths; the widest columns are narrowed down to their longest words."""
     columns = list(zip(*cells, strict=True))
     widths = [max(map(len, column)) for column in columns]
     least = [max(map(len, ' '.join(column).split(' '))) for column in columns]
-    while _total(widths) > _WIDTH:
+    while _total(widths) > limit:
         narrow = [i for i, width in enumerate(widths) if width > least[i]]
         if not narrow:
             break

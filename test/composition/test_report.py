@@ -58,12 +58,16 @@ def test_table_columns_are_aligned(rows: list[tuple[str, str, str]]) -> None:
 WORDS = st.lists(st.text('ab-', min_size=1, max_size=12), min_size=1, max_size=12).map(' '.join)
 
 
-@given(st.lists(st.tuples(WORDS, WORDS, WORDS, WORDS), min_size=1, max_size=3))
+@given(
+    st.lists(st.tuples(WORDS, WORDS, WORDS, WORDS), min_size=1, max_size=3), st.integers(54, 120)
+)
 @settings(deadline=None)
-def test_tables_fit_a_terminal(rows: list[tuple[str, ...]]) -> None:
-    """At most 100 columns, with every word in its column."""
-    lines = table(rows, ('a', 'b', 'c', 'd')).splitlines()
-    assert max(map(len, lines)) <= 100
+def test_tables_fit_a_terminal(rows: list[tuple[str, ...]], width: int) -> None:
+    """At most 100 columns or the width of the terminal, with every word in its column."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv('COLUMNS', str(width))
+        lines = table(rows, ('a', 'b', 'c', 'd')).splitlines()
+    assert max(map(len, lines)) <= min(100, width)
     starts = [match.start() for match in re.finditer('-+', lines[1])]
     columns = [
         ' '.join(' '.join(line[start:end].split()) for line in lines[2:])
