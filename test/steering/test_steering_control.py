@@ -510,7 +510,7 @@ def test_invalid_input_is_rejected() -> None:
     with pytest.raises(ShapeError, match='a tip measurement must be x and z'):
         controller.update([0.0, 0.0, 0.0], 0)
     with pytest.raises(ShapeError, match="a tip measurement must be x and z, got 'left'"):
-        controller.update('left', 0)
+        controller.update('left', 0)  # type: ignore[arg-type]
     for noise in (-1e-4, np.nan, np.inf):
         with pytest.raises(ParameterError, match='noise must be finite, >= 0 m'):
             controller.update([0.0, 0.0], 0, noise)
