@@ -4,7 +4,7 @@
 from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
-from math import nan
+from math import inf, isnan, nan
 
 from needle_controller.controller import Controller, ControllerOutput, Measurement
 from needle_controller.hardware import POSITION, Robot
@@ -80,6 +80,7 @@ class Commissioning:
 
     def __post_init__(self) -> None:
         self._time = self._depth = nan
+        self._steps: Generator[float, Measurement, None] | None = None
         if self.settings.enabled:
             self._check_configuration()
             self._restart(CommissioningPhase.WAITING)
@@ -109,11 +110,14 @@ class Commissioning:
 
     def _restart(self, phase: CommissioningPhase, result: str = '') -> None:
         own = self.controller.settings
-        self._steps: Generator[float, Measurement, None] | None = None
+        # An interrupted motion settles before the next measurement at rest.
+        self._settled = self._time + _SETTLING if self._steps is not None else -inf
+        self._steps = None
         #: Time, depth, velocity and force at rest, and changes since.
         self._rest: deque[tuple[float, ...]] = deque(maxlen=_AT_REST)
         self._rows = [np.zeros(6)]
         self._rate = RateMonitor(own.rate, own.measurement_timeout)
+        self._felt = self._feels()
         self.robot.probe, self.phase, self.result = nan, phase, result
 
     def command(self, measured: Measurement, moves: bool) -> ControllerOutput | None:
@@ -122,7 +126,9 @@ class Commissioning:
             return None
         longest = self.controller.settings.longest_gap
         elapsed, self._time = measured.time - self._time, measured.time
-        if not 0.0 < elapsed <= longest or (self._steps is not None and not moves):
+        interrupted = self._steps is not None and not moves
+        # The first force begins a new measurement at rest.
+        if not 0.0 < elapsed <= longest or interrupted or self._felt != self._feels():
             self._restart(CommissioningPhase.WAITING)
         force = 0.0
         try:
@@ -130,7 +136,8 @@ class Commissioning:
                 force = self._steps.send(measured)
             else:
                 self._depth = measured.depth
-                self._rest.append(self._row(measured))
+                if self._time >= self._settled:
+                    self._rest.append(self._row(measured))
                 if 0.0 < elapsed <= longest:
                     self._rate.add(round(NANOSECONDS * self._time), round(NANOSECONDS * elapsed))
                 if moves and len(self._rest) == _AT_REST:
@@ -146,7 +153,11 @@ class Commissioning:
         return ControllerOutput(force=force, setpoint=Setpoint(self._depth), refusal=refusal)
 
     def _row(self, measured: Measurement) -> tuple[float, ...]:
-        return measured.time, measured.depth, measured.velocity, *self.robot.reaction
+        force = np.nan_to_num(self.robot.reaction)
+        return measured.time, measured.depth, measured.velocity, *force
+
+    def _feels(self) -> bool:
+        return not isnan(self.robot.reaction[1])
 
     def _add(self, measured: Measurement) -> None:
         """Add a measurement; the joint must not move against or beyond the command."""

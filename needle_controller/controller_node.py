@@ -47,7 +47,7 @@ _RETRACT = 'retract_depth'
 #: timeout, and time between them [s].
 _AGAIN, _PAUSE = 5, 0.02
 
-_PATIENCE = 20  #: Checks without joint states before a warning is logged.
+_PATIENCE = 20  #: Checks of the inputs before one that the driver does not publish is reported.
 _GUIDE = {joint.name for joint in contract.STEERING_JOINTS}  #: Joints that no axis law controls.
 FEEDBACKS = ('observer', 'ground_truth', 'none')  #: Sources of the load of the bent needle.
 
@@ -132,7 +132,7 @@ class ControllerNode(ModelNode):
         self._driver: Driver | None = None
         self._command: Callable[[Any], None] | None = None
         self._action: TrajectoryAction | None = None
-        self._checks, self._missing = 0, ''
+        self._checks, self._missing = 0, dict[str, str]()
         self._write_wrench = contract.WRENCH_COMMAND.template().serialize
         self._write_aim = contract.REFERENCE.template().serialize
         self._system = SystemStateTopics(
@@ -274,7 +274,7 @@ class ControllerNode(ModelNode):
     def activate(self) -> None:
         """Start to answer measurements and to check for missing inputs."""
         self._supervisor.activate(self.now(), self._who_publishes())
-        self._checks, self._missing = 0, ''
+        self._checks, self._missing = 0, {}
         self._watchdog = steady_timer(
             self, self._supervisor.safety.watch_period, self._check_inputs
         )
@@ -352,17 +352,25 @@ class ControllerNode(ModelNode):
         """Check for missing inputs and for duplicate publishers."""
         if self.is_active:
             self._act(self._supervisor.watch(self.now(), self._who_publishes()))
-            if self._driver is not None and self._supervisor.waits:
+            if self._driver is not None:
                 self._check_driver(self._driver)
 
     def _check_driver(self, driver: Driver) -> None:
-        """Log why no joint states are received, each reason once, after discovery."""
+        """Log why an input was never received, each reason once, after discovery."""
         self._checks += 1
-        missing = driver.missing() if self._checks > _PATIENCE else ''
-        if missing != self._missing:
-            self._missing = missing
-            self._supervisor.events.add(Severity.WARNING, missing)
-            self.publish_events(self._supervisor.events)
+        if self._checks % _PATIENCE:
+            return
+        supervisor, before = self._supervisor, self._missing
+        streams = supervisor.safety.streams
+        names = [name for name in driver.robot.settings.expected if not streams[name].counts]
+        if supervisor.waits:
+            names.append(contract.JOINT_STATES.name)
+        self._missing = {name: driver.missing(name) for name in names}
+        for name, line in self._missing.items():
+            streams[name].refused = line
+            if line != before.get(name):
+                supervisor.events.add(Severity.WARNING, line)
+        self.publish_events(supervisor.events)
 
     # Outputs.
 
@@ -403,8 +411,9 @@ class ControllerNode(ModelNode):
         severity, held, status = self._supervisor.diagnose(self.now())
         if self._driver is not None:
             status = self._driver.with_robot(status)
-            if held is not None and self._supervisor.waits and self._missing:
-                held = f'{held}: {self._missing}'
+            missing = self._missing.get(contract.JOINT_STATES.name)
+            if held is not None and self._supervisor.waits and missing:
+                held = f'{held}: {missing}'
         return Diagnosis(severity, held or self.state, status)
 
 

@@ -11,7 +11,7 @@ from needle_controller.controller import Controller, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.laws.law import Axis
 from needle_dynamics import NeedleParameters
-from needle_ros.contract import INSERTION, ROTATION
+from needle_ros.contract import BASE_WRENCH, INSERTION, ROTATION
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import AXES, signed_axis
 from needle_ros.settings import check_constants, choice, constant, flag, positive, text
@@ -112,6 +112,11 @@ class HardwareSettings:
         return self.stamps == STAMPS[0]
 
     @property
+    def expected(self) -> tuple[str, ...]:
+        """Sensors of a named topic: their readings must be valid."""
+        return (BASE_WRENCH.name,) if self.wrench_topic else ()
+
+    @property
     def joints(self) -> tuple[str, ...]:
         """Joints of a command, in their order."""
         return self.command_joints or (self.joint,)
@@ -176,13 +181,13 @@ class Robot:
         self._base: Admittance | None = None
         #: Insertion depth to command for a check [m], NaN for no command; None without a check.
         self.probe: float | None = None
-        #: Last measured force on the needle, along x, y and z of ``needle_base`` [N].
-        self.reaction = 0.0, 0.0, 0.0
         self.begin()
 
     def begin(self) -> None:
         """Discard all measurements and commands."""
         self.estimates = False  #: Whether velocities are estimated.
+        #: Last accepted force on the needle, along x, y and z of ``needle_base`` [N], NaN before.
+        self.reaction = nan, nan, nan
         self._speed = _Speed()
         #: Positions of the other joints of a command to hold, in the unit of the robot.
         self._others: dict[str, float] = {}
@@ -268,7 +273,6 @@ class Robot:
         turned = tuple(
             sign * one * numbers[begin + axis] for begin in (0, 3) for axis, one in self._axes
         )
-        self.reaction = turned[0], turned[1], turned[2]
         return reading._replace(values=(turned,))
 
     # To the robot.

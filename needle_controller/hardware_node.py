@@ -192,21 +192,24 @@ class Driver:
             commissioning_result=self._check.result if self._check else '',
         )
 
-    def missing(self) -> str:
-        """Describe from the ROS graph why no joint states are received."""
-        node, topic = self._node, self.topics.state
+    def missing(self, name: str) -> str:
+        """Describe from the ROS graph why an input, by its name in the contract, is missing."""
+        node, topic = self._node, self.topics.wrench
+        setting, also = 'hardware.wrench_topic', ''
+        if name == contract.JOINT_STATES.name:
+            topic, setting, also = self.topics.state, 'hardware.state_topic', 'hardware.state_type'
         types = {one.topic_type for one in node.get_publishers_info_by_topic(topic.name)}
         if types == {topic.type_name}:
             return f'{topic.name} is published, but no message was received'
         if types:
             return (
                 f'{topic.name} is published as {", ".join(sorted(types))}, and read as '
-                f'{topic.type_name} (hardware.state_topic, hardware.state_type)'
+                f'{topic.type_name} ({", ".join(filter(None, (setting, also)))})'
             )
         others = _published(node, topic.type_name)
         return (
             f'no node publishes {topic.name}; {topic.type_name} is published on '
-            f'{", ".join(others) or "no topic"} (hardware.state_topic)'
+            f'{", ".join(others) or "no topic"} ({setting})'
         )
 
     # To the robot.

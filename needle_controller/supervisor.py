@@ -9,7 +9,7 @@ from typing import Final
 from needle_controller.controller import Controller, ControllerSettings, Measurement
 from needle_controller.force_command import ForceCommand
 from needle_controller.gains import AllGains
-from needle_controller.hardware import Robot
+from needle_controller.hardware import HardwareSettings, Robot
 from needle_controller.load_estimator import build_observer, LoadEstimator
 from needle_controller.observer.settings import ObserverSettings
 from needle_controller.safety.input_monitor import InputMonitor, Refusal, REPEATED
@@ -71,19 +71,18 @@ class Supervisor(StateMachine[ForceCommand]):
         observer = None
         if observed is not None:
             observer = build_observer(controller.parameters, observed, controller.period)
-        self.controller = controller
+        self.controller, self._robot = controller, robot
         self._following = ResponseMonitor(controller.parameters, controller.settings)
         self.bending = LoadEstimator(controller.parameters, observer, limits.axial_load)
-        self._robot = robot
-        noise = {} if observed is None else observed.sensor_noise
+        own = HardwareSettings() if robot is None else robot.settings
         stop, self._time = self.safety.stop, 0
         self.safety = Safety(
             limits,
             controller.settings,
             controller.parameters,
-            expected=tuple(noise),
-            noise=noise,
-            wrench_frame=(robot.settings.wrench_frame if robot is not None else '') or BASE,
+            expected=own.expected,
+            noise=None if observed is None else observed.sensor_noise,
+            wrench_frame=own.wrench_frame or BASE,
             simulated=simulated,
         )
         self.safety.stop = stop
@@ -288,7 +287,7 @@ class Supervisor(StateMachine[ForceCommand]):
         if self._active is None:
             return None
         answer, values = self._check_clock(now), reading.values[0]
-        _, axial, lateral, moment, _, _ = values
+        x, axial, lateral, moment, _, _ = values
         stream, guard = self.safety.streams['base_wrench'], self.safety.guard
         if self._is_valid(stream, reading, [lateral, moment, axial], now):
             answer = self._stop_for(guard.wrench(values[:3], values[3:]), now) or answer
@@ -297,6 +296,8 @@ class Supervisor(StateMachine[ForceCommand]):
             if not guard.is_beyond('base_wrench'):
                 self.finish()
                 self.bending.take_wrench(reading.stamp, lateral, moment)
+                if self._robot is not None:
+                    self._robot.reaction = x, axial, lateral
         return answer
 
     def truth(self, reading: Reading, now: int) -> ForceCommand | None:
@@ -429,9 +430,8 @@ class Supervisor(StateMachine[ForceCommand]):
         if not safety.streams['ground_truth'].is_current(now):
             self.bending.load = 0.0
         for name, line in safety.new_warnings(now).items():
-            self._warn(name, f'{line}; the observer continues without it')
-        if safety.limits.sensors_required:
-            answer = self._stop_for(safety.warning(now), now) or answer
+            self._warn(name, line)
+        answer = self._stop_for(safety.missing(now), now) or answer
         self._warn('pace', self._timing.compare_rate(self._joints))
         return answer
 

@@ -46,7 +46,8 @@ class InputMonitor:
 
     ``last`` is the stamp of the newest message that was in time, -1 before the first, and ``step``
     the time since the message before. ``counted`` is the time at which the last valid message was
-    received, and ``counts`` the messages by result of the check. With several ``publishers`` no
+    received, ``counts`` the messages by result of the check, and ``refused`` why the newest one is
+    not valid or missing. With several ``publishers`` no
     message is valid. ``window`` counts messages, and marks those out of order.
     """
 
@@ -77,7 +78,7 @@ class InputMonitor:
         self.counted: int | None = None
         self._values: Sequence[float] | None = None
         self._lively, self._changed = 0, 0
-        self.frozen = False
+        self.frozen, self.refused = False, ''
 
     def check(
         self, stamp: int, now: int, frame: str = '', values: Sequence[float] = ()
@@ -87,8 +88,10 @@ class InputMonitor:
         self.window.add(now, refusal is not None and refusal.kind == DROPPED)
         if refusal is None:
             self.counts[ACCEPTED] += 1
-            self.counted = now
+            self.counted, self.refused = now, ''
         else:
+            if not refusal.harmless:
+                self.refused = refusal.line
             self.counts[refusal.kind] += 1
         return refusal
 

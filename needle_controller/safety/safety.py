@@ -38,6 +38,7 @@ _READINGS: Final = {
     ),
 }  # fmt: skip
 
+_SENSORS: Final = ('base_wrench', 'tip_deflection')
 _VITAL: Final = ('wrench_command', 'joint_states')  #: Topics that need exactly one publisher.
 _LATE: Final = 0.5  #: Fraction of messages out of order for a warning.
 _MIXED: Final = 0.9  #: Fraction of messages out of order for a stop.
@@ -99,8 +100,8 @@ class SafetyLimits(CheckedSettings):
         high=3600.0,
     )
     sensors_required: bool = flag(
-        False, 'stop when base_wrench or tip_deflection, which the observer expects, are stale; '
-        'else the observer continues without them',
+        False, 'stop when base_wrench, or tip_deflection of the observer, is stale or rejected; '
+        'else the controller continues without it',
     )  # fmt: skip
 
 
@@ -214,9 +215,9 @@ class Safety:
     """
     Conditions for a force command: valid inputs, limits, no latched stop, one publisher per topic.
 
-    `expected` are the topics that must be published continuously, `noise` is the noise of the
-    sensor values by topic, and `wrench_frame` the frame of the force sensor. With `simulated` time
-    a message may arrive before the /clock of its stamp.
+    `expected` are the topics that must be published continuously, as must those of `noise`: the
+    noise of the sensor values by topic. `wrench_frame` is the frame of the force sensor. With
+    `simulated` time a message may arrive before the /clock of its stamp.
     """
 
     def __init__(
@@ -258,7 +259,8 @@ class Safety:
             )
             for name, (timeout, frames, jumps) in inputs.items()
         }
-        self._expected = expected
+        required = ['base_wrench'] if limits.sensors_required else []
+        self._expected = {*expected, *noise, *required}
         #: Start of encoder measurements without a gap [ns]; 0: no /clock yet.
         self._begun: int | None = None
         self._stale: set[str] = set()
@@ -298,8 +300,11 @@ class Safety:
             # Readings from before the silence are outdated.
             if not stream.is_current(now):
                 self.guard.forget(stream.name)
-        required = self.warning(now) if self.limits.sensors_required else None
-        return self.guard.violated or required
+        return self.guard.violated or self.missing(now)
+
+    def missing(self, now: int) -> str | None:
+        """Return the warning if the sensors are required."""
+        return self.warning(now) if self.limits.sensors_required else None
 
     def check_force(self, stamp: int, depth: float, force: float, torque: float) -> str | None:
         """Count a command at its limit; return a warning if its force bends the free part."""
@@ -335,31 +340,34 @@ class Safety:
         return f'joint_states has {share:.0%} of its messages out of order'
 
     def _silent(self, now: int) -> dict[str, str]:
-        """Return a line for each expected topic that is silent while the encoders are not."""
+        """Return a line for each sensor without valid messages while the encoders have some."""
         joints = self.streams['joint_states']
         if joints.counted is None or now - joints.counted > joints.timeout:
             self._begun = now or None
             return {}
         begun = self._begun = self._begun or joints.counted
-        return {
-            name: f'{name} is stale: no valid message for {silence:.1f} s'
-            for name in self._expected
-            if (silence := (now - max(self.streams[name].counted or 0, begun)) / NANOSECONDS)
-            > self.limits.sensor_timeout
-        }
+        lines = {}
+        for name in _SENSORS:
+            stream = self.streams[name]
+            silence = (now - max(stream.counted or 0, begun)) / NANOSECONDS
+            rejected = stream.refused and stream.window.rate(now) > 0.0
+            if silence > self.limits.sensor_timeout and (rejected or name in self._expected):
+                line = f'{name} is stale: no valid message for {silence:.1f} s'
+                lines[name] = '; '.join(filter(None, (line, stream.refused)))
+        return lines
 
     def new_warnings(self, now: int) -> dict[str, str]:
-        """Return a line for each expected topic that has become stale since the last call."""
+        """Return a line for each sensor that has become stale since the last call."""
         silent = self._silent(now)
         lines = {name: line for name, line in silent.items() if name not in self._stale}
         self._stale = set(silent)
         return lines
 
     def warning(self, now: int) -> str | None:
-        """Return the expected topics that are stale or frozen, and the topics out of order."""
+        """Return the sensors that are stale or frozen, and the topics out of order."""
         frozen = (
             f'{name} has not changed for {self.limits.sensor_timeout:g} s'
-            for name in self._expected
+            for name in _SENSORS
             if self.streams[name].frozen
         )
         silent = {

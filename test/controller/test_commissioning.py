@@ -26,6 +26,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import from_values
 from needle_ros.status import CommissioningPhase
 from needle_ros.system_state import CLEAR_STOP, PAUSE, RESUME, RETRACT
+from needle_ros.timing import NANOSECONDS
 import numpy as np
 import pytest
 
@@ -180,6 +181,39 @@ def test_force_sensor_axes_are_refused_with_the_correct_axis(kind: type[Simulate
     turned = {**one.hardware, 'reaction': not one.hardware['reaction']}
     found = refused(replace(one, hardware=turned))
     assert f'or hardware.reaction to {str(one.hardware["reaction"]).lower()}' in found.reason
+
+
+@pytest.mark.requirement('S-191', 'S-332')
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('seed', range(4))
+def test_wrong_reaction_is_refused_with_any_bias_and_delay_of_the_sensor(
+    kind: type[SimulatedRobot], seed: int
+) -> None:
+    """Until the end of the first motion; the correct one passes, and rejected readings, too."""
+    rng = np.random.default_rng(seed)
+    bias, delays = rng.uniform(-4.0, 4.0, 3), (0.0, rng.uniform(0.01, 0.5), rng.uniform(0.5, 1.4))
+    one = correct(kind, seed)
+    turned = {**one.hardware, 'reaction': not one.hardware['reaction']}
+    fixed = one.robot()
+    values = {name: getattr(fixed, name) for name in SimulatedRobot.__dataclass_fields__}
+
+    class Biased(kind):  # type: ignore[misc, valid-type]
+        delay, begun = 0.0, 0
+
+        def wrench(self, stamp: int) -> Any:
+            reading = super().wrench(stamp)
+            self.begun = self.begun or stamp
+            valid = stamp - self.begun >= NANOSECONDS * self.delay
+            force = (*(reading.values[0][:3] + bias), 0.0, 0.0, 0.0)
+            return reading._replace(frame=reading.frame if valid else 'other', values=(force,))
+
+    for delay in delays:
+        Biased.delay = float(delay)
+        case = replace(one, robot=lambda: Biased(**values))
+        assert run(case, check=True).phase is CommissioningPhase.PASSED
+        assert 'or hardware.reaction to' in refused(replace(case, hardware=turned)).reason
+    Biased.delay = np.inf
+    assert run(replace(case, hardware=turned), check=True).phase is CommissioningPhase.PASSED
 
 
 @pytest.mark.requirement('S-190')

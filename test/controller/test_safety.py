@@ -270,6 +270,45 @@ def test_silent_sensors_give_a_warning_while_encoders_are_received() -> None:
     assert whole.new_warnings(now + 9 * SECOND) == {}
 
 
+@pytest.mark.requirement('S-330')
+@pytest.mark.parametrize('name', ['base_wrench', 'tip_deflection'])
+@pytest.mark.parametrize('required', [False, True])
+def test_rejected_sensor_gives_a_warning_also_if_it_is_not_expected(
+    name: str, required: bool
+) -> None:
+    """With the reason, as long as every reading is rejected; required: also without readings."""
+    whole = safety(sensor_timeout=0.5, sensors_required=required)
+    joints, sensor = whole.streams['joint_states'], whole.streams[name]
+    frames = {'base_wrench': 'needle_base', 'tip_deflection': 'needle_entry'}
+    wrench = whole.streams['base_wrench']
+    now, said = 10 * SECOND, list[str]()
+
+    def go_on(seconds: float, frame: str | None) -> str | None:
+        nonlocal now
+        for _ in range(round(100 * seconds)):
+            now += 10 * MILLISECOND
+            joints.check(now, now)
+            if required and sensor is not wrench:
+                wrench.check(now, now, 'needle_base', [0.0, 0.0])
+            if frame is not None:
+                sensor.check(now, now, frame, [0.0])
+            said.extend(whole.new_warnings(now).values())
+        return whole.warning(now)
+
+    reason = f"{name} must be in frame '{frames[name]}', got 'other'"
+    assert go_on(0.4, None) is None
+    assert str(go_on(2.0, 'other')).endswith(reason)
+    assert whole.missing(now) == (whole.warning(now) if required else None)
+    assert len(said) == 1
+    assert go_on(0.1, frames[name]) is None
+    silent = go_on(3.0, None)
+    assert silent == (
+        f'{name} is stale: no valid message for 3.0 s'
+        if required and name == 'base_wrench'
+        else None
+    )
+
+
 @pytest.mark.requirement('S-073')
 def test_silence_is_measured_from_the_first_clock_message() -> None:
     """A node with simulated time is at 0 before the first /clock."""

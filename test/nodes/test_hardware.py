@@ -348,12 +348,34 @@ def test_position_robot_holds_its_measured_position_after_a_stop(ros_graph: RosG
     assert 0.025 < bench.depth < 0.05
 
 
-@pytest.mark.requirement('S-113')
-def test_wrong_frame_is_reported(ros_graph: RosGraph) -> None:
-    """With the expected frame."""
-    bench = Bench(ros_graph, hardware__wrench_frame='tool0')
-    bench.until(lambda: bench.input('base_wrench').rejected.get('frame'), 'the rejection')
+@pytest.mark.requirement('S-113', 'S-330')
+@pytest.mark.parametrize('required', [False, True])
+def test_wrong_frame_is_reported(ros_graph: RosGraph, required: bool) -> None:
+    """With the expected frame; a required sensor stops the motion."""
+    bench = Bench(ros_graph, hardware__wrench_frame='tool0', safety__sensors_required=required)
+    said = "no valid message for .* s; base_wrench must be in frame 'tool0', got 'ft_frame'"
+    bench.until(lambda: re.search(said, bench.said), 'the warning')
     assert bench.taken('base_wrench') == 0
+    if required:
+        bench.until(lambda: bench.stop, 'the stop')
+    assert (bench.stop is not None) == required
+
+
+@pytest.mark.requirement('S-331')
+def test_force_sensor_that_no_node_publishes_is_reported(ros_graph: RosGraph) -> None:
+    """With the published topics of its type."""
+    bench = Bench(ros_graph, hardware__wrench_topic='typo/wrench')
+    said = (
+        'base_wrench is stale: no valid message for .* s; no node publishes typo/wrench; '
+        r'geometry_msgs/msg/WrenchStamped is published on /ft_sensor/wrench \(hardware.wr'
+    )
+    bench.until(lambda: re.match(said, bench.said), 'the warning')
+
+
+def test_no_force_sensor_is_expected_without_its_topic(ros_graph: RosGraph) -> None:
+    bench = Bench(ros_graph, 'position', safety__sensor_timeout=0.1)
+    bench.until(lambda: bench.taken('joint_states') > 200, 'a second')
+    assert 'base_wrench' not in bench.said
 
 
 @pytest.mark.parametrize(
