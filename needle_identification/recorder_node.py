@@ -229,11 +229,12 @@ class RecorderNode(BaseNode):
                 number = about['publication_sequence_number']
                 if number is None:
                     continue
-                missing = number - self._newest.get(topic, number) - 1
-                self._newest[topic] = number
-                # Each publisher has its own sequence numbers.
-                if missing > 0 and len(recorded.offered) == 1:
-                    bag.lost[topic] += missing
+                newest = self._newest.get(topic, number)
+                self._newest[topic] = max(number, newest)
+                # Each publisher has its own sequence numbers; a new one may not be recorded yet.
+                single = len(recorded.offered) == 1
+                if number > newest + 1 and single and self.count_publishers(topic) == 1:
+                    bag.lost[topic] += number - newest - 1
         if data and topic in self._sampled:
             with suppress(MessageError):
                 stamp = self._sampled[topic](data).stamp

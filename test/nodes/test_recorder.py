@@ -454,3 +454,34 @@ def test_lost_messages_are_counted_and_reported(
     bag = Bag(tmp_path / 'bag')
     assert bag.losses == [f'the recorder lost {lost} of /flood']
     assert message_counts(tmp_path / 'bag')['/flood'] == status.recorded['/flood']
+
+
+@pytest.mark.parametrize('earlier', [0, 500])
+def test_second_publisher_is_no_loss(
+    ros_graph: RosGraph, record: Callable[..., Any], tmp_path: Path, earlier: int
+) -> None:
+    """Of a topic; it may have published `earlier` messages before, and end again."""
+    probe = ros_graph.node('probe')
+    deep = QoSProfile(depth=1000)
+    first = probe.create_publisher(String, 'text', deep)
+    node = record(tmp_path / 'bag', topics=['text'])
+    ros_graph.spin_until(first.get_subscription_count, 'the subscription')
+    for _ in range(100):
+        first.publish(String())
+    ros_graph.spin_until(lambda: node.diagnose().status.recorded['/text'] == 100, 'the first')
+    stranger = ros_graph.node('stranger')
+    second = stranger.create_publisher(String, 'text', deep)
+    for _ in range(earlier):
+        second.publish(String())
+    while not second.get_subscription_count():
+        # The recorder receives its messages before it has discovered it.
+        time.sleep(0.01)
+    for one in (first, second, first):
+        one.publish(String())
+        node._take(1000)
+    stranger.destroy_publisher(second)
+    ros_graph.spin_until(lambda: probe.count_publishers('text') == 1, 'its end')
+    for _ in range(50):
+        first.publish(String())
+    ros_graph.spin_until(lambda: node.diagnose().status.recorded['/text'] >= 153, 'the rest')
+    assert node.diagnose().status.lost == {}
