@@ -156,8 +156,19 @@ class Session:
                 ('recorder', contract.RECORDED),
             ):
                 # Without a plant of its own the session needs a robot.
-                most = own if name in self._nodes else 1
+                foreign = name not in self._nodes
+                # The name of a node is discovered after its publishers.
+                if foreign and monotonic() < end:
+                    continue
+                most = 1 if foreign else own
                 if self._node.count_publishers(topic.name) > most:
+                    if foreign:
+                        found = self._node.get_publishers_info_by_topic(topic.name)
+                        spaces = [(one.node_namespace.rstrip('/'), one.node_name) for one in found]
+                        raise GraphError(
+                            f'{len(found)} nodes publish {topic.name}: end all but one of '
+                            + ', '.join(sorted(map('/'.join, spaces)))
+                        )
                     raise GraphError(
                         f'another {name} is running on domain {self._graph.domain}: end it, or '
                         f'choose another {DOMAIN}'

@@ -354,6 +354,17 @@ def test_second_plant_is_rejected(ros_graph: RosGraph, tmp_path: Path) -> None:
     assert 'needle> target' not in said
 
 
+def test_two_robots_are_rejected_by_name(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """Before any motion, with the topic that both publish."""
+    for namespace in ('/', '/other'):
+        node = ros_graph.add(Node, f'drv{len(namespace)}', namespace=namespace)
+        node.create_publisher(JointState, '/joint_states', SENSOR)
+    status, _, complained = told(ros_graph, tmp_path / 'run', ['target 0.05'], '--hardware')
+    assert (status, complained) == (
+        1, 'error: 2 nodes publish joint_states: end all but one of /drv1, /other/drv6\n'
+    )  # fmt: skip
+
+
 def test_tip_is_steered_to_a_target(ros_graph: RosGraph, tmp_path: Path) -> None:
     status, said, complained = told(
         ros_graph,
