@@ -339,7 +339,7 @@ class Supervisor(StateMachine[ForceCommand]):
             self._origin = stamp if self._origin < 0 else self._origin
             measured = convert(Reading(stamp - self._origin, *reading[1:]))
         except ParameterError as error:
-            self._depth = None
+            self._depth, self._joints.refused = None, str(error)
             return self._release_for(str(error), stamp)
         if measured.is_finite():
             self._stop_for(self.safety.guard.encoders(measured), stamp)
@@ -424,7 +424,7 @@ class Supervisor(StateMachine[ForceCommand]):
         if safety.duplicate_publishers is not None:
             answer = self._release_for(safety.duplicate_publishers, now, FaultKind.PUBLISHERS)
         elif not self._joints.is_current(now):
-            line = f'joint_states is stale: none received for {self._joints.silence(now):.3f} s'
+            line = self._joints.stale(self._joints.silence(now))
             answer = self._release_for(line, now)
         answer = self._stop_for(safety.mixed_sources(now), now) or answer
         if not safety.streams['ground_truth'].is_current(now):

@@ -142,6 +142,11 @@ class InputMonitor:
         """Return the time since the last valid message [s]; zero before the first."""
         return (now - self.counted) / NANOSECONDS if self.counted is not None else 0.0
 
+    def stale(self, silence: float) -> str:
+        """Describe a time without a valid message [s], with the reason if it is known."""
+        line = f'{self.name} is stale: no valid message for {silence:.3f} s'
+        return '; '.join(filter(None, (line, self.refused)))
+
     def is_current(self, now: int) -> bool:
         """Return whether the last valid message is not older than the timeout."""
         return self.silence(now) * NANOSECONDS <= self.timeout

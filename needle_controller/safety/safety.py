@@ -352,8 +352,7 @@ class Safety:
             silence = (now - max(stream.counted or 0, begun)) / NANOSECONDS
             rejected = stream.refused and stream.window.rate(now) > 0.0
             if silence > self.limits.sensor_timeout and (rejected or name in self._expected):
-                line = f'{name} is stale: no valid message for {silence:.1f} s'
-                lines[name] = '; '.join(filter(None, (line, stream.refused)))
+                lines[name] = stream.stale(silence)
         return lines
 
     def new_warnings(self, now: int) -> dict[str, str]:

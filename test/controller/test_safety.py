@@ -261,8 +261,8 @@ def test_silent_sensors_give_a_warning_while_encoders_are_received() -> None:
         if i < 1000:
             wrench.check(now, now, 'needle_base', [0.0, 0.0])
         said += whole.new_warnings(now).values()
-    assert said == ['base_wrench is stale: no valid message for 0.5 s']
-    assert whole.warning(now) == 'base_wrench is stale: no valid message for 1.0 s'
+    assert said == ['base_wrench is stale: no valid message for 0.501 s']
+    assert whole.warning(now) == 'base_wrench is stale: no valid message for 1.000 s'
     now += MILLISECOND
     wrench.check(now, now, 'needle_base', [0.0, 0.0])
     assert whole.warning(now) is None
@@ -303,7 +303,7 @@ def test_rejected_sensor_gives_a_warning_also_if_it_is_not_expected(
     assert go_on(0.1, frames[name]) is None
     silent = go_on(3.0, None)
     assert silent == (
-        f'{name} is stale: no valid message for 3.0 s'
+        f'{name} is stale: no valid message for 3.000 s'
         if required and name == 'base_wrench'
         else None
     )

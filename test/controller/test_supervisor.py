@@ -12,6 +12,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from needle_controller import Controller, ForceCommand, Measurement, ObserverSettings, SafetyLimits
 from needle_controller.gains import LAWS
+from needle_controller.hardware import HardwareSettings
+from needle_controller.hardware import Robot as HardwareRobot
 from needle_controller.supervisor import Supervisor
 from needle_dynamics import NeedleModel, NeedleParameters
 from needle_ros.event_log import EventLog, Severity
@@ -344,6 +346,29 @@ def test_response_monitor_ignores_robots_without_force_or_in_motion(moves: bool)
             robot.runs(1, obeys=True)
             robot.loop.encoders(robot.loop.now, robot.loop.depth, robot.velocity, 0.0)
     assert not robot.loop.supervisor.controller.guide.waits
+
+
+@pytest.mark.requirement('S-112')
+def test_gap_does_not_hide_why_joint_states_are_rejected() -> None:
+    """Without velocities, on a busy machine; the next valid message ends it."""
+    loop = Loop()
+    robot = HardwareRobot(HardwareSettings(joint='slide'))
+    loop.supervisor.configure(Controller(PHANTOM), SafetyLimits(), None, robot)
+    loop.supervisor.activate(loop.now, {TOPIC: 1})
+    loop.now += PERIOD
+    reading = Reading(loop.now, '', ('slide',), ((0.02,), (), ()))
+    loop.supervisor.encoders(reading, loop.now)
+    reason = loop.supervisor.fault
+    assert reason.startswith("joint_states has no velocity of 'slide'")
+    loop.now += SECOND
+    loop.supervisor.watch(loop.now, {TOPIC: 1})
+    stale = 'joint_states is stale: no valid message for 1.000 s'
+    assert loop.supervisor.fault == f'{stale}; {reason}'
+    valid = Reading(loop.now, '', ('slide',), ((0.02,), (0.0,), ()))
+    loop.supervisor.encoders(valid, loop.now)
+    loop.now += SECOND
+    loop.supervisor.watch(loop.now, {TOPIC: 1})
+    assert loop.supervisor.fault == stale
 
 
 @given(st.integers(0, 2**62), st.sampled_from(LAWS))
