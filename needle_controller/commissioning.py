@@ -4,7 +4,7 @@
 from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
-from math import inf, isnan, nan
+from math import isnan, nan
 
 from needle_controller.controller import Controller, ControllerOutput, Measurement
 from needle_controller.hardware import POSITION, Robot
@@ -79,7 +79,7 @@ class Commissioning:
     result: str = ''
 
     def __post_init__(self) -> None:
-        self._time = self._depth = nan
+        self._time = self._depth = self._settled = nan
         self._steps: Generator[float, Measurement, None] | None = None
         if self.settings.enabled:
             self._check_configuration()
@@ -111,8 +111,8 @@ class Commissioning:
     def _restart(self, phase: CommissioningPhase, result: str = '') -> None:
         own = self.controller.settings
         # An interrupted motion settles before the next measurement at rest.
-        self._settled = self._time + _SETTLING if self._steps is not None else -inf
-        self._steps = None
+        if self._steps is not None:
+            self._steps, self._settled = None, self._time + _SETTLING
         #: Time, depth, velocity and force at rest, and changes since.
         self._rest: deque[tuple[float, ...]] = deque(maxlen=_AT_REST)
         self._rows = [np.zeros(6)]
@@ -136,7 +136,7 @@ class Commissioning:
                 force = self._steps.send(measured)
             else:
                 self._depth = measured.depth
-                if self._time >= self._settled:
+                if not 0.0 < self._settled - self._time <= _SETTLING:
                     self._rest.append(self._row(measured))
                 if 0.0 < elapsed <= longest:
                     self._rate.add(round(NANOSECONDS * self._time), round(NANOSECONDS * elapsed))
