@@ -8,7 +8,7 @@ from itertools import chain, islice
 from math import nan
 from pathlib import Path
 import shlex
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
 from needle_identification.bags.bag import Bag
@@ -25,6 +25,7 @@ from needle_identification.recordings.likeness import (
     velocity_of,
 )
 from needle_identification.recordings.merging import clock_offset
+from needle_identification.recordings.reading import is_configuration
 from needle_identification.recordings.samples import (
     are_gaps,
     EachJoint,
@@ -46,7 +47,8 @@ from needle_identification.steering.reading import (
 from needle_identification.stiffness.identify import identify_stiffness
 from needle_ros import wire
 from needle_ros.contract import GROUND_TRUTH, INSERTION, TOPICS
-from needle_ros.errors import NeedleError
+from needle_ros.errors import MessageError, NeedleError
+from needle_ros.parameter_file import parameters_in
 from needle_ros.quantities import AXES
 import numpy as np
 
@@ -258,7 +260,13 @@ def _bag(path: Path) -> Inspection:
         for topic in bag.topics()
         if topic.type_name in (*reading.MOTIONS, *_FORCE)
     }
-    for batch in bag.batches(lambda topic: topic in gathered):
+    robot: dict[str, Any] = {}
+    for batch in bag.batches(lambda one: one in gathered or is_configuration(one, 'controller')):
+        if batch.topic not in gathered:
+            with suppress(MessageError):
+                *_, (_, data) = batch.messages()
+                robot = parameters_in(wire.read_string(data))
+            continue
         for gathering in gathered[batch.topic].values():
             gathering.add(batch)
     contents, signals = [], []
@@ -280,7 +288,7 @@ def _bag(path: Path) -> Inspection:
     words, command = _steered(path, varying)
     if not command:
         components = {topic: len(list(chain(*parts))) for topic, parts in gathered.items()}
-        words, command = _suggestion(path, varying, components)
+        words, command = _suggestion(path, varying, components, robot)
     if not command:
         with suppress(NeedleError):
             words, command = _pressed(path)
@@ -312,7 +320,9 @@ def _signals(
         try:
             samples = gathering.samples(bag)
         except RecordingError as error:
-            losses.append(str(error))
+            # Commands of velocities or efforts have no positions: they are no motion.
+            if topic.type_name != wire.JOINT_STATE or not gathering.has_no_values:
+                losses.append(str(error))
             continue
         losses += bag.losses
         found += [
@@ -360,12 +370,16 @@ def _pressed(path: Path) -> tuple[list[str], str]:
 
 
 def _suggestion(
-    path: Path, signals: Sequence[_Signal], components: Mapping[BagTopic, int]
+    path: Path,
+    signals: Sequence[_Signal],
+    components: Mapping[BagTopic, int],
+    robot: Mapping[str, Any],
 ) -> tuple[list[str], str]:
     """
     Find the pair of force and motion that is most similar to friction.
 
-    `components` is the number of axes or joints of each topic, also of those at rest.
+    `components` is the number of axes or joints of each topic, also of those at rest, and `robot`
+    are the recorded parameters of the controller.
     """
     measured = [one for one in signals if one.topic.name.rpartition('/')[2] not in _COMPUTED]
     forces, motions = (
@@ -407,7 +421,10 @@ def _suggestion(
     ):
         if len([topic for topic in components if topic.type_name in types]) > 1:
             options += [option, one.topic.name]
-    axis = force.axis
+    axis, direction, scale = force.axis, 1.0, 1.0
+    if motion.axis == robot.get('hardware.joint') and motion.topic.type_name == wire.JOINT_STATE:
+        direction, scale = robot['hardware.sign'], robot['hardware.scale']
+    sense *= direction
     words += [_UNSIGNED] * (not sense)
     if sense < 0.0:
         words.append('the force is opposite to the motion: sign reversed')
@@ -416,7 +433,10 @@ def _suggestion(
         options += ['--force-axis', axis]
     usual = INSERTION if motion.topic.type_name == wire.JOINT_STATE else 'y'
     span = float(np.ptp(motion.values))
-    if motion.topic.type_name not in _VELOCITIES and span > reading.LONGEST_STROKE:
+    if (direction, scale) != (1.0, 1.0):
+        words.append(f'{motion.axis}: sign and scale of the robot, from the recorded parameters')
+        options += ['--motion-axis', f'{"-" * (direction < 0.0)}{motion.axis}*{scale:.9g}']
+    elif motion.topic.type_name not in _VELOCITIES and span > reading.LONGEST_STROKE:
         words.append(f'it moves over {span:.3g} m if it is in m: mm assumed')
         options += ['--motion-axis', f'{motion.axis}[mm]']
     elif motion.axis != usual and components[motion.topic] > 1:

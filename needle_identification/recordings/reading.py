@@ -16,7 +16,7 @@ from needle_identification.recordings import friction_table, samples, tables, TI
 from needle_identification.recordings.likeness import oblique
 from needle_identification.recordings.merging import merge, merged_recording
 from needle_identification.recordings.recording import IndentationRecording, Recording
-from needle_identification.recordings.units import BRACKETS, UNITS
+from needle_identification.recordings.units import foreign_unit, UNITS
 from needle_ros import wire
 from needle_ros.contract import (
     BASE_WRENCH,
@@ -79,10 +79,11 @@ def read_friction_recording(
         only such topic, else the topic with the last name joint_states or end_effector_pose.
     force_axis : str
         Component of the force into the tissue: x, y or z, with ``-`` for the opposite sign, and
-        with a unit in brackets if it is not N: ``-z[mN]``.
+        with a unit in brackets if it is not N: ``-z[mN]``, or a factor: ``-z*0.01``.
     motion_axis : str, optional
         Component of the motion into the tissue, likewise; default y. For a JointState the joint;
-        default insertion, or the only joint. With ``[mm]``, the velocity is in mm/s.
+        default insertion, or the only joint. With ``[mm]``, the velocity is in mm/s; with a
+        factor, ``spindle*0.0016``, in the same unit per s: here rad and rad/s.
     time : str
         Stamps to use, one of `TIMES`.
     columns : mapping of str to str, optional
@@ -221,10 +222,27 @@ def read_indentation_recording(
 
 
 def _without_unit(axis: Any, role: str) -> tuple[Any, float]:
-    """Split an axis, such as ``slide[mm]``, into its name and the size of its unit."""
-    found = BRACKETS.match(axis or '')
-    unit = found[2].strip() if found else ''
-    return (found[1], UNITS[role][unit]) if found and unit in UNITS[role] else (axis, 1.0)
+    """Split an axis, such as ``slide[mm]`` or ``spindle*0.002``, into its name and its factor."""
+    found = tables.SPEC.match(axis or '')
+    name, factor, unit = found.groups() if found else (axis, None, None)
+    if unit is not None and unit not in UNITS[role]:
+        if not foreign_unit(axis):
+            # An index, such as joint[0].
+            return axis, 1.0
+        raise ParameterError(
+            f'the unit of the axis {axis!r} must be one of {", ".join(UNITS[role])}, got '
+            f'{unit!r}; or state a factor: NAME*FACTOR'
+        )
+    size = UNITS[role][unit] if unit else 1.0
+    if factor is not None:
+        with suppress(ValueError):
+            size *= float(factor)
+            if size and np.isfinite(size):
+                return name, size
+        raise ParameterError(
+            f'the factor of the axis {axis!r} must be a finite number, not zero, got {factor!r}'
+        )
+    return name, size
 
 
 def _plane(
@@ -322,7 +340,7 @@ def read_samples(
         for topic, source in sources.items()
     }
     configuration = ''
-    for batch in bag.batches(lambda topic: topic in gathered or _is_configuration(topic)):
+    for batch in bag.batches(lambda topic: topic in gathered or is_configuration(topic, 'plant')):
         if batch.topic in gathered:
             gathered[batch.topic].add(batch)
         else:
@@ -332,5 +350,7 @@ def read_samples(
     return gathered, configuration
 
 
-def _is_configuration(topic: BagTopic) -> bool:
-    return topic.type_name == 'std_msgs/msg/String' and topic.name.endswith('plant/configuration')
+def is_configuration(topic: BagTopic, node: str) -> bool:
+    """Return whether a topic has the parameters of a node."""
+    kind = topic.type_name == 'std_msgs/msg/String'
+    return kind and topic.name.endswith(f'{node}/configuration')

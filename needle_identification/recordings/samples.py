@@ -339,6 +339,11 @@ class Gathering:
         if len(self._latencies) * few > many:
             self._latencies = [np.concatenate(self._latencies)[::2]]
 
+    @property
+    def has_no_values(self) -> bool:
+        """Whether there are messages, but none with finite values."""
+        return self._unusable > 0 and not len(self._series.stamps)
+
     def samples(self, bag: Bag) -> Samples:
         """Return the samples; add discarded data to the losses of the bag; raise on a fault."""
         name, series = self._topic.name, self._series

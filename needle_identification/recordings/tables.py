@@ -73,7 +73,7 @@ _SECONDS: Final = ('sec', 'seconds')  #: Names of times that are in s.
 _BLANKS: Final = re.compile(r'(?i)(([-+]?\d+(,\d+)?(e[-+]?\d+)?|nan)( +|$)){2,}')  # decimal commas
 _COMMAS: Final = re.compile(r'\s*[-+]?\d+,\d+(\s*,\s*[-+]?\d+,\d+)+\s*')  # between columns, too
 _WORD: Final = re.compile(r'[^0-9a-zµ]+')
-_SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
+SPEC: Final = re.compile(r'^\s*(.+?)\s*(?:\*\s*([^\[\]*]+?))?\s*(?:\[([^\]]*)\])?$')
 
 
 class Table(NamedTuple):
@@ -198,7 +198,7 @@ def column_values(
         # The name itself contains brackets.
         name, factor, unit = rest, None, None
     else:
-        match = _SPEC.match(rest)
+        match = SPEC.match(rest)
         if match is None:
             raise RecordingError(f'--columns {role}={spec} is not [-]NAME[*FACTOR][UNIT]')
         name, factor, unit = match.groups()

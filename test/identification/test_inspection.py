@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import json
 from pathlib import Path
+import re
 import shlex
 from typing import Any
 
@@ -18,12 +19,13 @@ from needle_identification import (
 from needle_identification.recordings.tables import column_roles
 from needle_identification.steering.reading import read_steering_recording, STEERING_ROLES
 from needle_insertion.cli import main
+from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import get_typestore, Stores
-from support.samples import EPOCH, header, joint_states, STORE, wrench
+from support.samples import EPOCH, header, joint_states, STORE, TEXT, text, wrench
 from support.steered_recording import recorded_plant
 from support.strokes import strokes
 
@@ -170,6 +172,49 @@ def test_an_oblique_motion_of_a_bag_is_named(
     assert any(said in one for one in found.words)
     assert run(found.command) == 0
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_sign_and_scale_of_a_recorded_robot_are_in_the_command(
+    tmp_path: Path, sign: float
+) -> None:
+    """Of a spindle in rad; its commanded efforts are no motion, without a warning."""
+    made, scale = strokes(seed=1, push=0.0), 0.0015
+    path = tmp_path / 'bag'
+    values = {'joint': 'spindle', 'sign': sign, 'scale': scale}
+    lines = ''.join(f'    hardware.{name}: {value}\n' for name, value in values.items())
+    with BagWriter(path) as bag:
+        bag.add_topic('/controller/configuration', TEXT)
+        bag.add_topic('/ft', WRENCH)
+        for topic in ('/joints', '/commands'):
+            bag.add_topic(topic, JOINTS)
+        content = f'/**/controller:\n  ros__parameters:\n{lines}'
+        bag.write('/controller/configuration', text(content), EPOCH)
+        for time, depth, force in zip(made.time, made.depth, made.force, strict=True):
+            stamp = EPOCH + round(1e9 * time)
+            position = sign * depth / scale
+            bag.write('/ft', wrench(stamp, force), stamp)
+            bag.write('/joints', joint_states(stamp, position, None, ['spindle']), stamp)
+            bare = STORE.types[JOINTS](
+                header(stamp), ['spindle'], np.array([]), np.array([]), np.array([force])
+            )
+            bag.write('/commands', bytes(STORE.serialize_cdr(bare, JOINTS)), stamp)
+    found = inspect_recording(path)
+    assert not found.losses
+    axis = f'{"-" * (sign < 0.0)}spindle*0.0015'
+    assert shlex.split(found.command)[-1] == axis
+    assert '--force-axis' not in found.command
+    assert run(found.command) == 0
+    topics: dict[str, Any] = {'wrench_topic': '/ft', 'motion_topic': '/joints'}
+    same = read_friction_recording(path, **topics, motion_axis=axis)
+    assert_allclose(np.ptp(same.depth), np.ptp(made.depth), rtol=1e-3)
+    for wrong, said in (
+        ('spindle[rad]', "must be one of m, mm, cm, in, inch, um, µm, μm, got 'rad'; or state a"),
+        ('spindle*x', "must be a finite number, not zero, got 'x'"),
+        ('spindle*0', "must be a finite number, not zero, got '0'"),
+    ):
+        with pytest.raises(ParameterError, match=re.escape(said)):
+            read_friction_recording(path, **topics, motion_axis=wrong)
 
 
 def test_a_motion_in_mm_of_a_bag_is_named(
