@@ -34,7 +34,7 @@ import numpy as np
 _TURNS: Final = np.array([1.0, 1.0j, -1.0, -1.0j])
 
 #: Logarithm of the likelihood ratio of a case to the right axes that stops the needle: half more
-#: than in 300 needles of the worlds of docs/steering.md, most of them in tissue that breathes.
+#: than of 1150 needles in the worlds of docs/steering.md.
 _STOP: Final = 18.0
 _FREEDOM: Final = 4.0  #: Degrees of freedom of the prior of the scale.
 _WIDER: Final = 5.0  #: Deviations of origin, frame, tilt and bevel, relative to the prior ones.
