@@ -58,6 +58,8 @@ STDERR, LIMIT = pytest.StashKey[int](), pytest.StashKey[float]()
 
 # Python processes started by tests print the stacks of their threads on SIGABRT.
 os.environ['PYTHONFAULTHANDLER'] = '1'
+# The largest width of tables; a worker of pytest-xdist states 80 columns.
+os.environ['COLUMNS'] = '100'
 
 # Deprecated: rcl warns about it on standard error, and ignores other settings.
 os.environ.pop('ROS_LOCALHOST_ONLY', None)
