@@ -225,10 +225,11 @@ def _without_unit(axis: Any, role: str) -> tuple[Any, float]:
     """Split an axis, such as ``slide[mm]`` or ``spindle*0.002``, into its name and its factor."""
     found = tables.SPEC.match(axis or '')
     name, factor, unit = found.groups() if found else (axis, None, None)
-    if unit is not None and unit not in UNITS[role]:
-        if not foreign_unit(axis):
-            # An index, such as joint[0].
-            return axis, 1.0
+    known = unit is None or unit in UNITS[role]
+    if (factor is None and unit is None) or not (known or foreign_unit(axis)):
+        # With the blanks of its name, and with an index, such as joint[0].
+        return axis, 1.0
+    if not known:
         raise ParameterError(
             f'the unit of the axis {axis!r} must be one of {", ".join(UNITS[role])}, got '
             f'{unit!r}; or state a factor: NAME*FACTOR'

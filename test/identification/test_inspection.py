@@ -209,7 +209,7 @@ def test_sign_and_scale_of_a_recorded_robot_are_in_the_command(
     same = read_friction_recording(path, **topics, motion_axis=axis)
     assert_allclose(np.ptp(same.depth), np.ptp(made.depth), rtol=1e-3)
     for wrong, said in (
-        ('spindle[rad]', "must be one of m, mm, cm, in, inch, um, µm, μm, got 'rad'; or state a"),
+        ('spindle[rad]', "microns, got 'rad'; or state a factor: NAME*FACTOR"),
         ('spindle*x', "must be a finite number, not zero, got 'x'"),
         ('spindle*0', "must be a finite number, not zero, got '0'"),
     ):
