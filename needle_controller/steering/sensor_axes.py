@@ -9,10 +9,10 @@ covariance C of all other causes, the whitened measurements z leave
 
 .. math:: s_T = |z|^2 + |p|^2 - 2 \, \mathrm{Re} \langle T p, z \rangle,
 
-so that two products are enough for all cases: T is a turn by a multiple of a quarter, or that of a
-mirror image. The scale of C is unknown, with an inverse gamma prior: the likelihood is a Student
-distribution [Gelman2013]_, which is robust to needles, tissue and sensors that differ from the
-model. It is summed over the points of the grid, because the sign of the response depends on
+so that two products are enough for all cases: T is a turn by a multiple of a quarter, alone or
+after a reflection. The scale of C is unknown, with an inverse gamma prior: the likelihood is a
+Student distribution [Gelman2013]_, which is robust to needles, tissue and sensors that differ from
+the model. It is summed over the points of the grid, because the sign of the response depends on
 bending length and skin. The formulas are in docs/steering.md.
 
 References
@@ -33,8 +33,8 @@ import numpy as np
 #: Factors of `SIGNED_PAIRS`.
 _TURNS: Final = np.array([1.0, 1.0j, -1.0, -1.0j])
 
-#: Logarithm of the likelihood ratio of a case to the right axes that stops the needle: half more
-#: than of 1150 needles in the worlds of docs/steering.md.
+#: Logarithm of the likelihood ratio of a case to the right axes that stops the needle: 1150
+#: needles in the worlds of docs/steering.md stay below 12.
 _STOP: Final = 18.0
 _FREEDOM: Final = 4.0  #: Degrees of freedom of the prior of the scale.
 _WIDER: Final = 5.0  #: Deviations of origin, frame, tilt and bevel, relative to the prior ones.
@@ -59,7 +59,7 @@ class SensorAxes:
         """
         Add a measurement of the tip, x + i z [m], at a depth number; raise for wrong axes.
 
-        ``guide`` is the position of the guide in each step [m], ``variance`` that of the
+        ``guide`` is the position of the guide in each step [m], ``variance`` the variance of the
         measurement along each axis [m^2].
         """
         row = self._covariance[at, self._at]

@@ -23,11 +23,11 @@ def measured_rows(tip: FloatArray) -> tuple[BoolArray, list[str]]:
     zero = zero_rows(tip)
     frozen = np.zeros_like(zero)
     frozen[~zero], is_held = _repeated(tip[~zero])
-    held = 'left out, as of a log at a higher rate than that of the sensor'
+    held = 'left out: the log has a higher rate than the sensor'
     words = []
     for lost, what, so in (
         (zero, 'zero', 'counted as lost'),
-        (frozen, 'exactly as the one before', held if is_held else 'counted as lost'),
+        (frozen, 'equal to the previous position', held if is_held else 'counted as lost'),
     ):
         places = np.count_nonzero(np.diff(lost.astype(np.int8), prepend=0) > 0)
         if places:
@@ -53,7 +53,7 @@ def _is_among(tip: FloatArray) -> bool:
 
 
 def _repeated(tip: FloatArray) -> tuple[BoolArray, bool]:
-    """Return which rows repeat the one before by no chance, and whether most rows do."""
+    """Return which rows repeat the previous row by no chance, and whether most rows do."""
     noise = np.sqrt(0.5 * np.mean(np.diff(tip, axis=0) ** 2, axis=0))
     if (_steps(tip) > _COARSE * noise).all():
         return np.zeros(len(tip), dtype=np.bool_), False

@@ -123,7 +123,7 @@ def test_outliers_are_counted_and_left_out() -> None:
     np.testing.assert_allclose(sizes, 1.0, atol=6.5e-3)
 
 
-@pytest.mark.parametrize('kind', ['zero', 'exactly as the one before'])
+@pytest.mark.parametrize('kind', ['zero', 'equal to the previous position'])
 def test_lost_tracking_is_as_missing_samples(kind: str) -> None:
     """Zeros and repeated positions are bursts of losses, to the bit."""
     clean = recorded(noise=1.8e-4)
@@ -157,9 +157,11 @@ def test_a_log_at_a_higher_rate_is_one_at_the_rate_of_the_sensor(times: float) -
     assert log.parameters == own.parameters
     count = np.count_nonzero(within) - np.count_nonzero(within[tip[place, 0] == 0.0])
     zeros = np.count_nonzero(tip[place, 0] == 0.0)
-    words = 'left out, as of a log at a higher rate than that of the sensor'
+    words = 'left out: the log has a higher rate than the sensor'
     assert log.warnings[0] == f'{zeros} positions are zero, in 1 places: counted as lost'
-    assert re.fullmatch(f'{count} positions are .* as the one before, .*{words}', log.warnings[1])
+    assert re.fullmatch(
+        f'{count} positions are equal to the previous position, .*{words}', log.warnings[1]
+    )
 
 
 @pytest.mark.parametrize('every', [1.0, 1.5])

@@ -473,9 +473,13 @@ def test_second_publisher_is_no_loss(
     second = stranger.create_publisher(String, 'text', deep)
     for _ in range(earlier):
         second.publish(String())
-    while not second.get_subscription_count():
-        # The recorder receives its messages before it has discovered it.
+    # Without events of the graph: the recorder has not discovered the publisher of its messages.
+    for _ in range(3000):
+        if second.get_subscription_count():
+            break
         time.sleep(0.01)
+    else:
+        pytest.fail('the recorder did not subscribe within 30 s')
     for one in (first, second, first):
         one.publish(String())
         node._take(1000)
