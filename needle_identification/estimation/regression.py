@@ -241,7 +241,8 @@ def _checked(
             f'regressors (n, k), response (n,) and used (n,) do not match: {x.shape}, {y.shape}, '
             f'{chosen.shape}'
         )
-    x, y = np.where(chosen[:, np.newaxis], x, 0.0), np.where(chosen, y, 0.0)
+    # By columns: operations on the long, few columns are two to five times as fast.
+    x, y = np.where(chosen, x.T, 0.0).T, np.where(chosen, y, 0.0)
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise ShapeError('regressors and response must be finite')
     return x, y, chosen
@@ -332,6 +333,6 @@ def independent_span(correlation: int) -> float:
 def score_covariance(scores: FloatArray, correlation: int) -> FloatArray:
     """Return the covariance (k, k) of the sum of correlated scores (n, k), zero where unused."""
     window = _window(correlation)
-    padded = np.pad(scores, ((len(window) // 2,) * 2, (0, 0)))
-    sums = convolve1d(padded, window, axis=0, mode='constant')
-    return np.asarray(sums.T @ sums / (window @ window))
+    padded = np.pad(scores.T, ((0, 0), (len(window) // 2,) * 2))
+    sums = convolve1d(padded, window, mode='constant')
+    return np.asarray(sums @ sums.T / (window @ window))

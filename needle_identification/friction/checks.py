@@ -103,7 +103,7 @@ def _of_zero(design: Design) -> Iterator[str]:
     terms = design.signals.settings.terms
     if 'coulomb' not in terms or 'offset' in terms:
         return
-    if not design.screening.tried(design.columns(['offset'])[design.used]).determined:
+    if not design.screening.tried(design.columns(['offset']).take(design.rows, axis=0)).determined:
         cure = '' if 'direction' in terms else ', or record both directions'
         yield f'mu_s includes the zero of the force sensor: tare it before contact{cure}'
 
@@ -136,7 +136,7 @@ def noise_bias(design: Design, fit: Regression) -> float:
     k = names.index('viscous_friction')
     if not fit.determined[k]:
         return 0.0
-    x = design.regressors(settings.terms)[design.used, : len(columns)]
+    x = design.regressors(settings.terms).take(design.rows, axis=0)[:, : len(columns)]
     bias = float(fit.values[k] * fit.samples * noise**2 * np.linalg.pinv(x.T @ x)[k, k])
     return bias if abs(bias) > 0.5 * fit.errors[k] else 0.0
 

@@ -166,9 +166,9 @@ class Design:
         """Add the derivative of the fitted force by the lag as a regressor."""
         settings, step = self.signals.settings, 0.5 * self.signals.period
         early, now, late = (self.columns(settings.terms, shift) for shift in (-step, 0.0, step))
-        used = self.used
-        solution = np.linalg.lstsq(now[used], self.signals.force[used], rcond=None)[0]
-        column = np.where(used, (late - early) @ solution / (2.0 * step), 0.0)
+        x, y = now.take(self.rows, axis=0), self.signals.force.take(self.rows)
+        solution = np.linalg.lstsq(x, y, rcond=None)[0]
+        column = np.where(self.used, (late - early) @ solution / (2.0 * step), 0.0)
         return replace(self, lag_column=column[:, np.newaxis])
 
     def solve(self, terms: Sequence[str], estimator: str) -> Regression:

@@ -128,11 +128,9 @@ _Alternative = Callable[[Recording, _Candidate], _Candidate | None]
 def _fitted(signals: FilteredSignals, *remarks: str) -> _Candidate:
     """Fit at the lag that the motion determines, with its rest as an unknown, if any."""
     settings = signals.settings
-    coarse, fine = find_lag(signals)
-    if fine is not None:
-        design = select_samples(signals, fine, abs(fine))
+    coarse, design = find_lag(signals)
+    if design is not None:
         design.check()
-        design = design.with_lag_column()
         fit = design.solve(settings.terms, settings.estimator)
         # The force is not linear in a lag above the filter length.
         if fit.errors[-1] < HALF_LENGTH / settings.cutoff:
@@ -287,7 +285,11 @@ def _finished(name: str, chosen: _Candidate, among: int) -> FrictionEstimate:
             force=signals.force,
             model=np.where(used, signals.force - fit.residual, nan),
             used=used,
-            moments=moments(design.columns(settings.terms)[used], fit.residual[used], known),
+            moments=moments(
+                design.columns(settings.terms).take(design.rows, axis=0),
+                fit.residual.take(design.rows),
+                known,
+            ),
         ),
     )
 

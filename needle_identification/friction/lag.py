@@ -25,6 +25,8 @@ _BETTER: Final = 0.5  # largest fraction of the misfit that remains with an acce
 _MAX_SAMPLES: Final = 1000  # largest number of samples for the coarse search
 
 _MAX_ITERATIONS: Final = 10
+_NEAR: Final = 0.05  # step before the last [sampling periods]; the samples depend on the lag
+_CONVERGED: Final = 1e-3  # step that needs no other, likewise
 _LARGEST_NOISE: Final = 0.1  # largest share of noise in the power of the acceleration
 
 #: Smallest ratio of root mean square and largest acceleration at which the lag is reported.
@@ -41,13 +43,14 @@ SAME_SCALE: Final = 0.01  #: largest error of the scale of a velocity that is no
 _UNKNOWN: Final = ParameterEstimate(name='lag', symbol='tau', unit='s')
 
 
-def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
-    """Return the coarse lag [s] (0: none), and the lag of least misfit [s] (None: unknown)."""
+def find_lag(signals: FilteredSignals) -> tuple[float, Design | None]:
+    """Return the coarse lag [s] (0: none), and a design near the best lag (None: unknown)."""
     terms = signals.settings.terms
     if 'inertia' in terms:
         # It resembles a lag.
         return 0.0, None
     lag = coarse = _coarse_lag(signals)
+    design, is_near = None, False
     for _ in range(_MAX_ITERATIONS):
         design = select_samples(signals, lag, abs(lag))
         if not design.is_enough:
@@ -56,41 +59,42 @@ def find_lag(signals: FilteredSignals) -> tuple[float, float | None]:
         if power * _LARGEST_NOISE <= signals.acceleration_noise**2:
             return coarse, None
         design = design.with_lag_column()
-        x, used = design.regressors(terms)[design.used], design.used
-        change = float(np.linalg.lstsq(x, signals.force[used], rcond=None)[0][-1])
-        lag += change
+        x, y = design.regressors(terms), signals.force
+        x, y = x.take(design.rows, axis=0), y.take(design.rows)
+        change = float(np.linalg.lstsq(x, y, rcond=None)[0][-1])
+        # The regression includes the last step.
+        if is_near or abs(change) < _CONVERGED * signals.period:
+            break
+        lag, is_near = lag + change, abs(change) < _NEAR * signals.period
         if abs(lag) > 2.0 * _LARGEST_LAG:
             return coarse, None
-        # The last step is part of the final regression.
-        if abs(change) < 0.05 * signals.period:
-            break
-    return coarse, lag
+    return coarse, design
 
 
 def _coarse_lag(signals: FilteredSignals) -> float:
     """Return the best lag in steps of half the filter [s]; 0 if zero lag fits nearly as well."""
     every = max(1, len(signals.time) // _MAX_SAMPLES)
-    step = signals.half_filter * signals.period
-    count = int(_LARGEST_LAG / step)
-    lags = step * np.arange(-count, count + 1)
+    count = int(_LARGEST_LAG / (signals.half_filter * signals.period))
+    lags = signals.half_filter * np.arange(-count, count + 1)
     misfits = [_misfit(signals, lag, every) for lag in lags.tolist()]
     best = int(np.argmin(misfits))
     if not misfits[best] < _BETTER * misfits[count]:
         return 0.0
     # The subsampled search may miss contradicting samples at the edges of strokes.
-    lag = float(lags[best])
-    return lag if _misfit(signals, lag, 1) < _BETTER * _misfit(signals, 0.0, 1) else 0.0
+    lag = int(lags[best])
+    is_better = _misfit(signals, lag, 1) < _BETTER * _misfit(signals, 0, 1)
+    return lag * signals.period if is_better else 0.0
 
 
-def _misfit(signals: FilteredSignals, lag: float, every: int) -> float:
-    """Return the mean squared misfit at a lag of every n-th sample; nan if too few move."""
+def _misfit(signals: FilteredSignals, lag: int, every: int) -> float:
+    """Return the mean squared misfit at a lag [samples] of every n-th sample; nan: few move."""
     settings, time, force = signals.settings, signals.time[::every], signals.force[::every]
-    then = np.clip(time - lag, time[0], time[-1])
-    velocity, acceleration = signals.motion(then), signals.motion(then, 1)
+    then = np.clip(np.arange(-lag, len(signals.time) - lag, every), 0, len(signals.time) - 1)
+    delayed = (one.take(then) for one in (*signals.undelayed, signals.depth))
+    velocity, acceleration, depth = delayed
     moving = np.abs(velocity) > signals.moving_speed
     if np.count_nonzero(moving) <= FEWEST_SAMPLES:
         return np.nan
-    depth = np.interp(then, signals.time, signals.depth)
     sign, fresh = np.sign(velocity), np.zeros_like(moving)
     motion = NeedleMotion(velocity, acceleration, time - time[0], depth, fresh, sign)
     x = regressors(motion, settings.terms, settings)[moving]
