@@ -46,6 +46,8 @@ wheel: setup
 
 # The marker is written last: an interrupted setup restarts. Older versions of pip install without a word.
 $(VENV)/.complete: requirements.lock setup.py package.xml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "error: $(PYTHON) is Python " \
+		+ sys.version.split()[0] + ", 3.10 or newer is needed: make setup PYTHON=...")'
 	@echo 'installing 760 MB into $(VENV), a minute or two'
 	@test ! -L $(VENV) || rm $(VENV)  # A link leads to another environment, which venv would empty.
 	$(PYTHON) -m venv --clear --without-pip $(VENV)

@@ -27,7 +27,7 @@ from needle_ros.process import ENDINGS
 #: Help text of each subcommand; key: its module in `needle_insertion.commands`, or in `ABOVE`.
 COMMANDS: Final[Mapping[str, str]] = {
     'compile': 'compile all functions for this machine, once',
-    'demo': 'insertion, recording, identification and a report',
+    'demo': 'insertion, recording, identification and a report (from a clone)',
     'run': 'start the nodes and send them targets',
     'watch': 'show a live insertion or a bag in a browser',
     'inspect': 'list the contents of recordings, and how to identify from them',
@@ -172,9 +172,13 @@ class _Parser(argparse.ArgumentParser):
         else:
             _, _, words = message.partition('unrecognized arguments: ')
             given = [word.partition('=')[0] for word in words.split() if word.startswith('-')]
-            options = dict(self._options())
+            options: dict[str, list[str]] = {}
+            for name, command in self._options():
+                options.setdefault(name, []).append(command)
             others = [
-                f'{word} is an option of {options[word]}' for word in given if word in options
+                f'{word} is an option of {" and ".join(options[word])}'
+                for word in given
+                if word in options
             ]
             if others:
                 self.exit(2, f'{self.prog}: error: {message}; {", ".join(others)}\n')

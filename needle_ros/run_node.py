@@ -75,7 +75,10 @@ def run(kind: Callable[[], BaseNode]) -> int:
         except (ParameterException, NeedleError, RuntimeError) as error:
             # rcl raises RuntimeError for invalid arguments or parameter files, and for a node that
             # SROS2 rejects.
-            sys.stderr.write(f'error: {" ".join(str(error).split())}\n')
+            words = ' '.join(str(error).split())
+            if 'initialize logging' in words:
+                words += '; set ROS_LOG_DIR to a folder that can be written'
+            sys.stderr.write(f'error: {words}\n')
             return INVALID_INPUT
         _read_files(node)
         spinning = True

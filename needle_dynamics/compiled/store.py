@@ -37,6 +37,9 @@ FOLDER_VARIABLE: Final = 'NUMBA_CACHE_DIR'
 SUFFIX: Final = '.nbc'
 PORTABLE_SUFFIX: Final = '.v3.nbc'
 
+#: File whose bytes are locks.
+_LOCK: Final = 'needle.lock'
+
 #: Environment of a process that compiles for a processor level, and the features of this level.
 PORTABLE: Final = {'NUMBA_CPU_NAME': 'x86-64-v3', 'NUMBA_CPU_FEATURES': '+avx2,+bmi2,+fma'}
 _FEATURES: Final = {
@@ -82,6 +85,16 @@ def writable_folder() -> Path | None:
             continue
         return folder
     return None
+
+
+def clear() -> int:
+    """Delete the machine code in all `folders`; return the number of functions."""
+    found = [file for folder in folders() for file in folder.glob(f'*{SUFFIX}')]
+    for file in found:
+        file.unlink(missing_ok=True)
+    for folder in folders():
+        (folder / _LOCK).unlink(missing_ok=True)
+    return len(found)
 
 
 @cache
@@ -233,7 +246,7 @@ class Store:
 @cache
 def _lock_file(folder: Path) -> int:
     """Open the file whose bytes are locks, until the end of the process."""
-    return os.open(folder / 'needle.lock', os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    return os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
 
 
 def _lock(folder: Path, name: str) -> bool:

@@ -10,7 +10,7 @@ import sys
 from typing import Final
 
 from needle_dynamics.compiled.cache import is_kept, kernels, prepare, where_kept
-from needle_dynamics.compiled.store import PORTABLE, writable_folder
+from needle_dynamics.compiled.store import clear, PORTABLE, writable_folder
 from needle_insertion.commands.common import add_flag
 from needle_insertion.progress import ProgressLine
 from needle_ros.process import cores
@@ -48,9 +48,13 @@ LATER: Final = ('needle_controller.compiled.many_loop', 'needle_dynamics.compile
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     portable = 'compile for every processor of the level x86-64-v3, for a wheel'
     add_flag(parser, '--portable', portable)
+    add_flag(parser, '--clear', 'delete all compiled functions, as before an uninstallation')
 
 
 def run(options: argparse.Namespace) -> int:
+    if options.clear:
+        sys.stdout.write(f'deleted {clear()} compiled functions\n')
+        return 0
     if options.portable:
         # Numba reads these when it is imported, with the first kernel.
         os.environ.update(PORTABLE)

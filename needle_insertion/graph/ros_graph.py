@@ -162,6 +162,10 @@ class Graph:
             os.environ.update(LOCAL)
             free = filterfalse(is_claimed, range(1, 101))
             self.domain = self._domain.enter_context(domain_id(partial(next, free)))
+        if not {'ROS_LOG_DIR', 'ROS_HOME'} & os.environ.keys():
+            # The default is in the home folder, which may be missing or not writable.
+            os.environ['ROS_LOG_DIR'] = str(self._logs.absolute() / 'ros')
+            self._domain.callback(os.environ.pop, 'ROS_LOG_DIR')
         self.environment = {**os.environ, 'ROS_DOMAIN_ID': str(self.domain), END_WITH_PARENT: '1'}
         self.context = Context()
         self.context.init(domain_id=self.domain)

@@ -9,6 +9,7 @@ from typing import Any, Final
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from needle_dynamics.arrays import BoolArray, FloatArray
 import needle_identification as identification
 from needle_insertion.report.identify_text import label_of
@@ -168,7 +169,8 @@ def _ellipses(axes: Axes, estimate: identification.StiffnessEstimate) -> None:
 
 def stiffness_levels(summary: identification.StiffnessSummary) -> Figure:
     """Draw each entry of the matrix against the force, with Table 2."""
-    figure = Figure(figsize=(_WIDTH, 5.5), layout='constrained')
+    # The legend is above the axes: Matplotlib 3.6 has no place outside all axes.
+    figure = Figure(figsize=(_WIDTH, 5.5), layout=ConstrainedLayoutEngine(rect=(0, 0, 1, 0.91)))
     for axes, (name, (means, deviations)) in zip(
         figure.subplots(2, 2, sharex=True).flat, TABLE_2.items(), strict=True
     ):
@@ -193,7 +195,7 @@ def stiffness_levels(summary: identification.StiffnessSummary) -> Figure:
     for axes in figure.axes[2:]:
         axes.set_xlabel('force [N]')
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside upper left', frameon=False)
+    figure.legend(handles, labels, loc='upper left', frameon=False)
     return figure
 
 

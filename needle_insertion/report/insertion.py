@@ -129,7 +129,9 @@ def draw_needle(
         axes.set(ylabel=f'{"xyz"[k]} [mm]', xlim=(begin, end), ylim=limit, aspect='equal')
         axes.grid(visible=True, alpha=0.3)
     axes.set_xlabel('depth y [mm]')
-    figure.legend(*axes.get_legend_handles_labels(), loc='outside upper right', ncols=4)
+    # Above the axes: Matplotlib 3.6 has no place outside all axes.
+    handles, labels = axes.get_legend_handles_labels()
+    planes[0].legend(handles, labels, loc='lower right', bbox_to_anchor=(1.0, 1.0), ncols=4)
     return figure
 
 

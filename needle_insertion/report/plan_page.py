@@ -360,10 +360,12 @@ def _add_legend(drawing: Any, legend: Legend, shown: Section, marks: list[Any]) 
     return _legend(drawing, entries, 'lower center')
 
 
-def _legend(drawing: Any, entries: list[Any], place: str) -> int:
+def _legend(drawing: Any, entries: list[Any], place: str, **where: Any) -> int:
     longest = max(len(one.get_label()) for one in entries)
     columns = min(len(entries), max(1, _CHARACTERS // (longest + 8)), 4)
-    added = drawing.legend(handles=entries, loc=place, ncols=columns, fontsize=8, frameon=False)
+    added = drawing.legend(
+        handles=entries, loc=place, ncols=columns, fontsize=8, frameon=False, **where
+    )
     # Names may contain a dollar sign.
     for text in added.get_texts():
         text.set_parse_math(False)
@@ -412,7 +414,8 @@ def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
         rows[1].set(ylabel='guide [mm]')
         words += ' Below: setpoints of the guide.'
     entries = [one for row in rows for one in row.get_legend_handles_labels()[0]]
-    count = _legend(drawing, entries, 'outside upper center')
+    # Above the axes: Matplotlib 3.6 has no place outside all axes.
+    count = _legend(rows[0], entries, 'lower center', bbox_to_anchor=(0.5, 1.0))
     drawing.set_figheight(drawing.get_figheight() + 0.18 * count)
     rows[-1].set(xlabel='depth [mm]', xlim=(0.0, depths[-1]))
     return Picture('plan_depth', words, drawing)

@@ -37,7 +37,9 @@ ANSWERS = {
     'steer --set lenght=1m': "did you mean 'length'?",
     'steer --set length': '--set takes NAME=VALUE',
     'steer --set tissue_stiffness=0': 'tissue_stiffness must be > 0 N/m^2',
-    'identify steering table.csv --report page': '--report is an option of needle identify',
+    'identify steering table.csv --report page': (
+        '--report is an option of needle identify friction and needle identify stiffness'
+    ),
     'steer --prior noise=-1': 'noise must be finite, > 0 and <= 0.1 m',
     'steer -o picture.pdf': 'the picture must be .png',
     'steer -o nowhere/picture.png': 'its folder does not exist',

@@ -226,6 +226,15 @@ def test_without_a_writable_folder_each_start_compiles(toy: Path) -> None:
         assert 'NUMBA_CACHE_DIR' in error
 
 
+def test_clear_deletes_machine_code_only(monkeypatch: Any, tmp_path: Path) -> None:
+    monkeypatch.setenv(store.FOLDER_VARIABLE, str(tmp_path))
+    for name in (f'a.b-1{SUFFIX}', f'a.c-1{SUFFIX}', 'a.b.cpython-311.pyc', 'results.csv'):
+        (tmp_path / name).write_text('1')
+    assert store.clear() == 2
+    assert {path.name for path in tmp_path.iterdir()} == {'a.b.cpython-311.pyc', 'results.csv'}
+    assert store.clear() == 0
+
+
 def test_compiled_files_depend_only_on_compiled_files() -> None:
     """The stamp covers all functions and constants that a compiled function uses."""
     shared = 'needle_dynamics.compiled'

@@ -87,6 +87,18 @@ def test_unknown_argument_is_rejected(ros_graph: RosGraph) -> None:
     assert 'unknown: rate:=500; set parameters with --ros-args -p NAME:=VALUE' in said
 
 
+def test_missing_home_folder_names_the_remedy(ros_graph: RosGraph, tmp_path: Path) -> None:
+    (tmp_path / 'file').touch()
+    for name in ('ROS_LOG_DIR', 'ROS_HOME'):
+        ros_graph.environment.pop(name, None)
+    home = {'HOME': str(tmp_path / 'file' / 'home')}
+    asked = started(ros_graph, 'plant', environment=home)
+    said, _ = asked.communicate(timeout=60.0)
+    assert asked.returncode == 2
+    assert said.startswith('error: failed to initialize logging')
+    assert said.endswith('set ROS_LOG_DIR to a folder that can be written\n')
+
+
 def test_active_node_logs_its_state_and_ignores_repeated_ctrl_c(ros_graph: RosGraph) -> None:
     """One line has needle, rate and topics. The exit status is 0 for any number of Ctrl-C."""
     came = ros_graph.listen(ros_graph.node('probe'), JointState, 'joint_states', SENSOR)

@@ -80,9 +80,14 @@ def told(
     *words: str,
     rate: float | None = 200.0,
     longest: float = _LONGEST,
+    home: Path | None = None,
 ) -> tuple[int, str, str]:
     """Run a script; return status, output and errors."""
     line, environment = command(ros_graph, folder, *words, rate=rate)
+    if home is not None:
+        for name in ('ROS_LOG_DIR', 'ROS_HOME'):
+            environment.pop(name, None)
+        environment['HOME'] = str(home)
     process = subprocess.Popen(
         line,
         env=environment,
@@ -184,6 +189,17 @@ def test_first_status_is_of_active_nodes(ros_graph: RosGraph, tmp_path: Path) ->
     assert re.search(r'^plant +OK +active$', said, re.MULTILINE), said
     assert 'not active' not in said
     assert 'no joint_states yet' not in said
+
+
+def test_run_needs_no_home_folder(ros_graph: RosGraph, tmp_path: Path) -> None:
+    """As for the user of a service: the logs of ROS are in the folder of the run."""
+    (tmp_path / 'file').touch()
+    status, said, complained = told(
+        ros_graph, tmp_path / 'run', ['status'], home=tmp_path / 'file' / 'home'
+    )
+    assert (status, complained) == (0, '')
+    assert re.search(r'^controller +OK ', said, re.MULTILINE), said
+    assert [*(tmp_path / 'run' / 'logs' / 'ros').glob('*.log')]
 
 
 def test_warnings_of_nodes_that_wait_are_kept_for_the_session() -> None:
