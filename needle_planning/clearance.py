@@ -25,7 +25,7 @@ from needle_planning.compiled.boxes import BoxTree, LEAF, line_clearances, point
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_CAP: Final = 0.03  #: Largest clearance that is distinguished [m].
+LIMIT: Final = 0.03  #: Largest clearance that is distinguished [m].
 _BITS: Final = 10  #: Bits of each coordinate of the order of the boxes.
 
 #: No gain by a bow, see `line_clearances`.
@@ -179,7 +179,7 @@ class _Grid:
         margins = np.array([one.margin + radius for _, one in self._obstacles])
         points = frame.of_patient(region)
         self._low, self._high = points.min(axis=0) - beyond, points.max(axis=0) + beyond
-        away = _CAP + margins.max(initial=0.0)
+        away = LIMIT + margins.max(initial=0.0)
         shape = np.array(anatomy.labels.shape)
         low = np.ceil((self._low - away) / frame.spacing - 0.5).clip(0, shape).astype(int)
         high = np.floor((self._high + away) / frame.spacing + 1.5).clip(low, shape).astype(int)
@@ -204,7 +204,7 @@ class _Grid:
         values, nearest = np.empty(len(own)), np.empty(len(own), dtype=np.int64)
         point_clearances(self._boxed, own, values, nearest)
         outside = np.maximum(np.maximum(self._low - own, own - self._high), 0.0)
-        bound = _CAP - np.linalg.norm(outside, axis=1)
+        bound = LIMIT - np.linalg.norm(outside, axis=1)
         nearest[bound < values] = -1
         return np.minimum(values, bound), nearest, own
 
@@ -312,7 +312,7 @@ def _tree(
         most[half:count] = most[count : 2 * count].reshape(half, 2).max(axis=1)
         count = half
     bounds[:, 0] = region
-    tree = BoxTree(corners[0], corners[1], margin, bounds[0], bounds[1], most, _CAP)
+    tree = BoxTree(corners[0], corners[1], margin, bounds[0], bounds[1], most, LIMIT)
     return tree, order
 
 

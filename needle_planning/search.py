@@ -11,7 +11,8 @@ has a larger clearance than
 
 with the gain b(s) that a bow of the needle can add (zero for a straight needle), at any set of
 fractions s. A cell whose bound exceeds the best line by at most the resolution h is discarded, and
-the others are divided.
+the others are divided. Of all lines whose clearance equals that of the best one, to the accuracy
+of a clearance, the shortest is used.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ _FIRST: Final = 16e-3  #: Size of the first cells [m].
 _PART: Final = 0.1  #: Tolerance of the clearance of a line, as a fraction of the resolution.
 _SQUARE: Final = 1e-3  #: Size of the squares of a disc [m].
 _CHUNK: Final = 256  #: Lines of a job.
+_JOBS: Final = 8  #: Jobs of lines of increasing length that are examined at once.
 _NEAR: Final = 1e-6  #: Least length of a line [m].
 
 
@@ -143,7 +145,8 @@ def disc_region(point: FloatArray, radius: float, target: FloatArray) -> EntryRe
 class Lines:
     """Result of the search: the lines that were examined, and the bound on all others."""
 
-    entries: FloatArray  #: entry points that are long enough, the best one first [m], shape (m, 3)
+    #: entry points that are near enough, the best one first, else by clearance [m], shape (m, 3)
+    entries: FloatArray
     clearances: FloatArray  #: least clearance of their lines with the gain [m], shape (m,)
     #: No needle from the region has a larger clearance if the gain bounds its deflection [m].
     bound: float
@@ -189,7 +192,7 @@ def search_lines(
     progress: Callable[[str], object] | None = None,
 ) -> Lines:
     """
-    Find the line with the largest clearance.
+    Find the line with the largest clearance; of lines with equal clearance, the shortest.
 
     Parameters
     ----------
@@ -218,13 +221,16 @@ def search_lines(
     checked('resolution', resolution, 'm', low=0.0, open_low=True)
     search = _Search(clearance, target, reach, resolution, bow)
     centers, radius, size = region.centers, region.radius, _FIRST
+    #: Upper bounds on the clearance of lines from each box, and numbers of the boxes that remain.
+    bounds, boxes = np.full(len(centers), np.inf), np.arange(len(centers))
     while len(centers):
         cells, cell = _grouped(region.frame.of_patient(centers), radius, size)
         if progress is not None:
             progress(f'entry points {1e3 * size:.3g} mm apart')
-        kept = search.examine(_Cells(centers[cells.points], cells.radii))
+        kept, upper = search.examine(_Cells(centers[cells.points], cells.radii))
         single = len(kept) == len(centers)
-        centers = centers[kept[cell]]
+        bounds[boxes] = upper[cell]
+        centers, boxes = centers[kept[cell]], boxes[kept[cell]]
         if single:
             break
         size *= 0.5
@@ -238,9 +244,9 @@ def search_lines(
         radius = float(np.linalg.norm(halves))
         if progress is not None:
             progress(f'entry points {2e3 * radius:.2g} mm apart')
-        kept = search.examine(_Cells(centers, np.full(len(centers), radius)))
+        kept, _ = search.examine(_Cells(centers, np.full(len(centers), radius)))
         centers = centers[kept]
-    return search.result()
+    return search.result(region.centers, bounds)
 
 
 def _least(resolution: float) -> float:
@@ -261,6 +267,10 @@ class _Search:
     ) -> None:
         self._clearance, self._target, self._reach = clearance, target, reach
         self._resolution, self._bow = resolution, bow
+        #: Accuracy of the clearance of a line, and difference of equal ones [m]. With a bow, lines
+        #: are candidates whose clearance is computed later.
+        self._tolerance = _PART * resolution
+        self._equal = 0.0 if bow.any() else self._tolerance
         self._best = -np.inf
         self._found: list[tuple[FloatArray, FloatArray]] = []
         self._discarded = -np.inf
@@ -269,10 +279,10 @@ class _Search:
     @property
     def _enough(self) -> float:
         """Bound of a cell that needs no further division [m]."""
-        return max(self._best, 0.0) + self._resolution
+        return max(self._best - self._equal, 0.0) + self._resolution
 
-    def examine(self, cells: _Cells) -> BoolArray:
-        """Evaluate the lines of cells; return whether each must be divided, shape (m,)."""
+    def examine(self, cells: _Cells) -> tuple[BoolArray, FloatArray]:
+        """Evaluate the lines of cells; return whether to divide each, and its bound, (m,)."""
         lengths = np.linalg.norm(cells.points - self._target, axis=1)
         possible = lengths - cells.radii <= self._reach
         enough = self._enough
@@ -280,7 +290,7 @@ class _Search:
         usable = (lengths <= self._reach) & (lengths > _NEAR) & np.isfinite(found.least)
         if usable.any():
             # The true least clearance is within the tolerance of the value at examined points.
-            least = found.least[usable] - _PART * self._resolution
+            least = found.least[usable] - self._tolerance
             self._found.append((cells.points[usable], least))
             self._best = max(self._best, float(least.max()))
         to_divide = possible & (found.upper > self._enough)
@@ -289,7 +299,7 @@ class _Search:
             first = done[found.upper[done].argmax()]
             if found.upper[first] > self._discarded:
                 self._discarded, self._nearest = float(found.upper[first]), cells.points[first]
-        return np.asarray(to_divide)
+        return np.asarray(to_divide), found.upper
 
     def _evaluate(self, cells: _Cells, enough: float) -> LineClearance:
         def part(begin: int) -> LineClearance:
@@ -299,7 +309,7 @@ class _Search:
                 self._target,
                 radii=np.ascontiguousarray(cells.radii[some]),
                 bow=self._bow,
-                tolerance=_PART * self._resolution,
+                tolerance=self._tolerance,
                 enough=enough,
             )
 
@@ -307,11 +317,33 @@ class _Search:
             parts = list(pool.map(part, range(0, len(cells.points), _CHUNK)))
         return LineClearance(*(np.concatenate(one) for one in zip(*parts, strict=True)))
 
-    def result(self) -> Lines:
+    def _shortest(
+        self, entry: FloatArray, centers: FloatArray, bounds: FloatArray
+    ) -> tuple[FloatArray, float]:
+        """Return the shortest line that is as clear as the best, of `entry`: (3,), clearance."""
+        # The difference is within the bound of the search.
+        if not 0.0 < self._equal < self._best:
+            return entry, self._best
+        near = centers[bounds > self._best]
+        points = np.concatenate([near, *(one for one, _ in self._found)])
+        lengths = np.linalg.norm(points - self._target, axis=1)
+        shorter = (lengths < np.linalg.norm(entry - self._target)) & (lengths > _NEAR)
+        points = points[shorter][np.argsort(lengths[shorter], kind='stable')]
+        for begin in range(0, len(points), _JOBS * _CHUNK):
+            some = points[begin : begin + _JOBS * _CHUNK]
+            found = self._evaluate(_Cells(some, np.zeros(len(some))), self._best)
+            if len(equal := np.flatnonzero(found.least > self._best)):
+                return some[equal[0]], float(found.least[equal[0]]) - self._equal
+        return entry, self._best
+
+    def result(self, centers: FloatArray, bounds: FloatArray) -> Lines:
+        """Return the lines; `bounds` are those of lines from boxes with some centers, (n, 3)."""
         entries = np.concatenate([np.empty((0, 3)), *(one for one, _ in self._found)])
         values = np.concatenate([np.empty(0), *(one for _, one in self._found)])
         order = np.argsort(-values, kind='stable')
+        entries, values = entries[order], values[order]
+        if len(entries):
+            first, value = self._shortest(entries[0], centers, bounds)
+            entries, values = np.vstack([first, entries]), np.append(value, values)
         bound = max(self._discarded, self._best)
-        return Lines(
-            entries=entries[order], clearances=values[order], bound=bound, nearest=self._nearest
-        )
+        return Lines(entries=entries, clearances=values, bound=bound, nearest=self._nearest)

@@ -69,6 +69,11 @@ class Plan(Displayed):
         return float(self.depths[-1])
 
     @property
+    def at_limit(self) -> bool:
+        """Whether the clearance is at the limit of the search, 30 mm, and may be larger."""
+        return not self.structure
+
+    @property
     def axes(self) -> FloatArray:
         """Axes x, y (direction) and z of the guide in patient coordinates, rows, shape (3, 3)."""
         return guide_axes(self.direction)

@@ -18,6 +18,7 @@ from needle_insertion.commands import common
 from needle_insertion.progress import ProgressLine
 from needle_insertion.report.content import table
 from needle_planning.anatomy import plan_warnings
+from needle_planning.clearance import LIMIT
 from needle_planning.paths import SKIN_LIMIT
 from needle_planning.planner import find_plan, RESOLUTION
 from needle_ros.errors import ParameterError
@@ -259,6 +260,7 @@ def document_of(plan: Plan, seconds: float) -> dict[str, Any]:
         'target [m]': plan.target.tolist(),
         'length [m]': plan.length,
         'clearance [m]': plan.clearance,
+        'clearance may be larger': plan.at_limit,
         'structure': plan.structure,
         'place [m]': plan.place.tolist(),
         'bow [m]': plan.bow,
@@ -281,16 +283,27 @@ def text_of(plan: Plan, seconds: float) -> str:
         )
     ]
     kind = f'bowed by up to {1e3 * plan.bow:.2f} mm' if plan.guide.any() else 'straight'
-    near = f'to {plan.structure}' if plan.structure else 'to all obstacles'
     travel = 1e3 * np.abs(plan.guide).max(initial=0.0)
     return (
         f'path found in {seconds:.1f} s: {plan.needle}, {len(plan.guide)} steps to '
         f'{1e3 * plan.length:.1f} mm, {kind}, guide within {travel:.2f} mm\n'
-        f'clearance {1e3 * plan.clearance:.2f} mm {near}, beyond its margin; no straight needle '
-        f'has more than {1e3 * plan.straight_bound:.2f} mm,\n'
-        f'no needle within the limits of the guide more than {1e3 * plan.bound:.2f} mm\n\n'
+        f'{_clearance(plan)}\n\n'
         f'{table(rows, ("", "R [mm]", "A [mm]", "S [mm]"))}'
     )
+
+
+def _clearance(plan: Plan) -> str:
+    found, limit = f'{1e3 * plan.clearance:.2f} mm', f'{1e3 * LIMIT:g} mm'
+    if plan.at_limit:
+        return f'clearance at least {found} to all obstacles, searched up to {limit}'
+    straight = f'no straight needle has more than {1e3 * plan.straight_bound:.2f} mm'
+    every = f'no needle within the limits of the guide more than {1e3 * plan.bound:.2f} mm'
+    # Clearances above the limit are not distinguished.
+    if plan.straight_bound >= LIMIT:
+        straight = f'a straight needle may have {limit} or more'
+    if plan.bound >= LIMIT:
+        every = f'a needle within the limits of the guide may have {limit} or more'
+    return f'clearance {found} to {plan.structure}, beyond its margin; {straight},\n{every}'
 
 
 def chance_text(chance: Chance) -> str:

@@ -100,6 +100,7 @@ def write_plan_page(
         for name, one in zip(('plan_x', 'plan_z', 'plan_across'), planes, strict=True)
     ]
     near = f'to {plan.structure}' if plan.structure else 'to all obstacles'
+    least = 'at least ' * plan.at_limit + _mm(plan.clearance)
     bent = plan.guide.any()
     warnings = plan_warnings(every, plan.target, plan.entry, plan.direction)
     words = 'Drag to turn, or use the arrow keys. Obstacles are opaque, all else is translucent.'
@@ -115,7 +116,7 @@ def write_plan_page(
         'Clearances are beyond the margins of the obstacles.'
         + ''.join(f' Warning: {one}.' for one in warnings),
         cards=[
-            ('Least clearance', f'{_mm(plan.clearance)} mm', near),
+            ('Least clearance', f'{least} mm', near),
             ('Length', f'{_mm(plan.length)} mm', f'{len(plan.guide)} steps'),
             ('Bow', f'{_mm(plan.bow)} mm', 'largest deflection from the straight line'),
             *([] if chance is None else [('Success', *chance.rows()[-1][1:])]),

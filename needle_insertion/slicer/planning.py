@@ -184,10 +184,10 @@ class SlicerPlanner:
             self._report(line, Severity.ERROR)
             return
         kind = 'bowed' if plan.guide.any() else 'straight'
-        near = f' to {plan.structure}' if plan.structure else ''
+        near = f' to {plan.structure}' if plan.structure else ' to all obstacles'
         line = (
             f'plan for the {target}: {kind}, entry {_point(MILLIMETERS * plan.entry)} mm, '
-            f'clearance {MILLIMETERS * plan.clearance:.2f} mm{near}'
+            f'clearance {"at least " * plan.at_limit}{MILLIMETERS * plan.clearance:.2f} mm{near}'
         )
         line = '; '.join([line, *warnings])
         severity = Severity.WARNING if warnings else Severity.INFO

@@ -15,6 +15,7 @@ from needle_controller.steering.free_space import UNITS
 from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics import find_needle, FloatArray, SteeredNeedle
 from needle_dynamics.steering.needle import inserted_shape
+from needle_insertion.commands.plan import text_of
 from needle_planning import find_plan, NoPathError, Plan, read_plan, write_plan
 from needle_planning.anatomy import Anatomy, Structure
 from needle_planning.clearance import Clearance
@@ -125,6 +126,52 @@ def test_search_agrees_with_brute_force_on_200_anatomies() -> None:
             # Bounded to 5 um; samples are 50 um apart.
             assert plan.clearance <= line.min() + 1e-9 <= plan.clearance + 6e-5, seed
     assert 60 < sum(found) < 170
+
+
+def test_shortest_of_equal_lines_is_used() -> None:
+    """
+    No voxel of the entry region has a shorter line with the largest clearance of all.
+
+    Lines are equal if the least clearance is that of the target, or the limit of the search.
+    """
+    equal = 0
+    for seed in range(120):
+        case = Case(seed)
+        # Far obstacles: the clearance is at the limit.
+        case.boxes = case.boxes[: seed % 3]
+        labels = np.where(case.anatomy.labels == ENTRY, ENTRY, 0)
+        for label, (low, high, _) in enumerate(case.boxes, FIRST):
+            labels[tuple(map(slice, low, high))] = label
+        case.anatomy = replace(case.anatomy, labels=labels)
+        plan = plan_or_error(case)
+        if not isinstance(plan, Plan):
+            continue
+        away = (case.entries - case.target) * case.spacing
+        lengths = np.linalg.norm(away, axis=1)
+        s = np.linspace(0.0, 1.0, 1000)[:, np.newaxis]
+        entries = case.entries[lengths < plan.length - 1e-9, np.newaxis]
+        clearances = case.clearances(entries * (1.0 - s) + s * case.target).min(axis=1)
+        assert (clearances < plan.straight_bound - 1e-9).all(), seed
+        equal += plan.straight_bound - plan.clearance < 1e-5
+    assert equal > 20
+
+
+def test_clearance_at_the_limit_is_at_least_that() -> None:
+    """Text and page do not state a bound that is not searched."""
+    anatomy = window()
+    labels = np.where(anatomy.labels == 1, 0, anatomy.labels)
+    labels[:, :, 0] = 1
+    high = find_plan(replace(anatomy, labels=labels), (0.042, 0.041, 0.05), bow=False)
+    assert high.at_limit
+    text = text_of(high, 0.0)
+    assert 'clearance at least 30.00 mm to all obstacles, searched up to 30 mm' in text
+    assert 'no straight needle' not in text
+    near = find_plan(anatomy, TARGET, bow=False)
+    assert not near.at_limit
+    assert 'no straight needle has more than' in text_of(near, 0.0)
+    far = text_of(replace(near, straight_bound=0.03, bound=0.03), 0.0)
+    assert 'a straight needle may have 30 mm or more,' in far
+    assert 'a needle within the limits of the guide may have 30 mm or more' in far
 
 
 def test_larger_resolution_is_as_true() -> None:
