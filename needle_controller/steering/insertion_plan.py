@@ -17,13 +17,17 @@ from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.parameters import SteeringParameters
 from needle_ros.errors import ParameterError
 from needle_ros.files import read_yaml, write_whole
-from needle_ros.settings import checked
+from needle_ros.settings import checked, unknown_name
 import numpy as np
 import yaml
 
 DIRECTIONS: Final = 16  #: Number of directions of the free space about a path.
 MOST_LAYERS: Final = 8  #: Most layers of tissue along a line.
 _FORMAT: Final = 1  #: Version of the file.
+_FRAME: Final = 'RAS, SI units'  #: Frame and units of the file.
+_HEAD: Final = 'plan', 'frame'  #: Keys of a file before the fields of a plan.
+_MORE: Final = 'simulation'  #: Key of a file that may follow them.
+_SAME: Final = 1e-4  #: Tolerance of the target [m], and of the length of the direction [1].
 #: Fields of a plan that are distances.
 _DISTANCES: Final = 'radius', 'bow', 'resolution'
 #: Constants of `SteeringParameters` with one value for each layer.
@@ -125,13 +129,13 @@ def write_plan(plan: Plan, path: Path | str, simulation: Mapping[str, Any] | Non
         Results of simulated insertions, `Chance.document`.
 
     """
-    more = {'simulation': dict(simulation)} if simulation else {}
+    more = {_MORE: dict(simulation)} if simulation else {}
     values = {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in asdict(plan).items()
     }
     text = yaml.safe_dump(
-        {'plan': _FORMAT, 'frame': 'RAS, SI units', **values, **more},
+        {'plan': _FORMAT, 'frame': _FRAME, **values, **more},
         default_flow_style=None,
         sort_keys=False,
         width=100,
@@ -151,12 +155,20 @@ def read_plan(path: Path | str) -> Plan:
     Returns
     -------
     Plan
-        The same plan; NeedleError if the file is not a plan.
+        The same plan; NeedleError with file and key if it is not a plan of `write_plan`.
 
     """
     document = read_yaml(path)
     if not isinstance(document, dict) or document.get('plan') != _FORMAT:
         raise ParameterError(f'{path} is not a plan of format {_FORMAT}')
+    names = [item.name for item in fields(Plan)]
+    known = (*_HEAD, *names, _MORE)
+    if unknown := [key for key in document if key not in known]:
+        raise ParameterError(f'{path}: {unknown_name(str(unknown[0]), known)}')
+    if missing := [name for name in (*_HEAD, *names) if name not in document]:
+        raise ParameterError(f'{path}: {missing[0]} is missing')
+    if document['frame'] != _FRAME:
+        raise ParameterError(f'{path}: frame must be {_FRAME}, got {document["frame"]!r}')
     guide = document.get('guide')
     if not (isinstance(guide, list) and guide):
         raise ParameterError(f'{path}: guide must be a list of setpoints x, z, got {guide!r}')
@@ -166,18 +178,33 @@ def read_plan(path: Path | str) -> Plan:
         'guide': (steps, 2), 'path': (steps + 1, 3), 'clearances': (steps + 1,),
     }  # fmt: skip
     values: dict[str, Any] = {
-        item.name: _value(f'{path}: {item.name}', item.name, document.get(item.name), shapes)
-        for item in fields(Plan)
+        name: _value(f'{path}: {name}', name, document[name], shapes) for name in names
     }
     plan = Plan(**values)
     if plan.depths[0] != 0.0 or (np.diff(plan.depths) <= 0.0).any():
         raise ParameterError(f'{path}: depths must increase from 0 m')
-    if not np.linalg.norm(plan.direction) > 0.0:
-        raise ParameterError(f'{path}: direction must not be zero')
+    if abs(norm := float(np.linalg.norm(plan.direction)) - 1.0) > _SAME:
+        raise ParameterError(f'{path}: direction must have the length 1, got {norm + 1.0:.6g}')
+    off = float(np.linalg.norm(plan.entry + plan.length * plan.direction - plan.target))
+    if off > _SAME:
+        raise ParameterError(
+            f'{path}: target must be entry + length * direction, with the last of depths '
+            f'{plan.length:g} m as length; it is {1e3 * off:.4g} mm from there'
+        )
     return plan
 
 
+def _check_numbers(name: str, value: object) -> None:
+    """Raise `ParameterError` if a list has anything but numbers, such as true or text."""
+    for one in value if isinstance(value, list) else ():
+        if isinstance(one, list):
+            _check_numbers(name, one)
+        elif isinstance(one, bool) or not isinstance(one, (int, float)):
+            raise ParameterError(f'{name} must be numbers, got {one!r}')
+
+
 def _value(name: str, item: str, value: object, shapes: Mapping[str, tuple[int, ...]]) -> object:
+    _check_numbers(name, value)
     if item == 'layers':
         return _layers(name, value)
     if item == 'free':

@@ -16,7 +16,7 @@ from needle_controller.steering.settings import SteeringLimits
 from needle_dynamics import find_needle, FloatArray, SteeredNeedle
 from needle_dynamics.steering.needle import inserted_shape
 from needle_insertion.commands.plan import text_of
-from needle_planning import find_plan, NoPathError, Plan, read_plan, write_plan
+from needle_planning import find_plan, NoPathError, Plan
 from needle_planning.anatomy import Anatomy, Structure
 from needle_planning.clearance import Clearance
 from needle_planning.paths import Line, needle_radius
@@ -25,11 +25,13 @@ from needle_ros.errors import NeedleError, ParameterError
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.anatomies import affine, center, liver, SKIN
+from support.anatomies import affine, center, liver, SKIN, window
+from support.anatomies import ENTRY_LABEL as ENTRY
+from support.anatomies import WINDOW_TARGET as TARGET
 
 RESOLUTION = 5e-4
 RADIUS = needle_radius(find_needle('bending_35mm').needle)
-ENTRY, FIRST = 9, 1  #: Labels of the entry region, and of the first obstacle.
+FIRST = 1  #: Label of the first obstacle.
 
 
 class Case:
@@ -187,26 +189,6 @@ def test_larger_resolution_is_as_true() -> None:
                 bounds.append((-np.inf, plan.bound))
                 assert plan.bound <= resolution
         assert all(low <= high + 1e-9 for low, _ in bounds for _, high in bounds), seed
-
-
-def window(margin: float = 1e-3, shift: int = 0) -> Anatomy:
-    """Return voxels of 2 mm with two slabs, whose gaps are displaced by a number of voxels."""
-    labels = np.zeros((40, 40, 60), dtype=np.int16)
-    labels[:, :, 44] = labels[:, :, 24] = 1
-    labels[12:18, 16:22, 44] = 0
-    labels[16 + shift : 21 + shift, 18:23, 24] = 0
-    labels[:, :, 58] = ENTRY
-    return Anatomy(
-        labels=labels,
-        to_patient=affine([2e-3] * 3),
-        structures={
-            1: Structure(name='bone', role='obstacle', margin=margin),
-            ENTRY: Structure(name='skin', role='entry'),
-        },
-    )
-
-
-TARGET = np.array([0.042, 0.041, 0.006])
 
 
 def moved(anatomy: Anatomy, motion: FloatArray) -> Anatomy:
@@ -525,19 +507,6 @@ def test_images_with_other_grids_are_all_respected() -> None:
         find_plan([anatomy, wall], TARGET, bow=False)
 
 
-def test_plan_file_is_the_plan(tmp_path: Path) -> None:
-    """A plan that is written and read is the same, to the last bit."""
-    plan = find_plan(window(1.3e-3, 2), TARGET, entry=(0.028, 0.038, 0.117))
-    file = tmp_path / 'plan.yaml'
-    write_plan(plan, file)
-    again = read_plan(file)
-    for item in fields(Plan):
-        assert np.array_equal(getattr(plan, item.name), getattr(again, item.name)), item.name
-    assert again.length == plan.length
-    assert again.axes == pytest.approx(plan.axes)
-    assert list(plan.to_dataframe()) == list(plan.columns())
-
-
 @pytest.mark.parametrize('shift', [0, 2])
 def test_free_space_is_free_to_its_edge(shift: int) -> None:
     """In every direction: clear before the edge, and not clear just beyond it, by brute force."""
@@ -565,37 +534,6 @@ def test_free_space_is_free_to_its_edge(shift: int) -> None:
         assert (clearances(part * free) >= 0.0).all()
     # One sample limits the distance, to 10 um and the rounding of its depth.
     assert clearances(free)[free < 0.01].max() < 2e-5
-
-
-@pytest.mark.parametrize(
-    ('old', 'new', 'message'),
-    [
-        ('plan: 1', 'plan: 2', 'is not a plan of format 1'),
-        ('needle: bending_35mm', 'needle: 3', 'needle must be text, got 3'),
-        ('roll: 0.0', 'roll: right', "roll must be a number, got 'right'"),
-        ('roll: 0.0', '', 'roll must be a number, got None'),
-        ('entry: [', 'entry: [1.0, ', r'entry must have shape \(3,\), got \(4,\)'),
-        ('target: [', 'target: [.nan, 0, 0]\nother: [', 'target must be finite, got nan'),
-        ('depths: [', 'depths: [0.0, ', 'depths must have shape'),
-        ('guide:', 'guides:', 'guide must be a list of setpoints x, z, got None'),
-        ('depths: [0.0', 'depths: [1.0', 'depths must increase from 0 m'),
-        ('frame:', '\tframe:', r'plan\.yaml is not YAML'),
-        ('free:', 'free: [[0.1, 1.0]]\nspace:', r'free must have shape \(n, 17\), got \(1, 2\)'),
-        ('free:', f'free: [{[0.1] + [-1.0] * 16}]\nspace:', 'free must be at increasing depths'),
-    ],
-)
-def test_damaged_plan_is_rejected_by_a_line(
-    old: str, new: str, message: str, tmp_path: Path
-) -> None:
-    file = tmp_path / 'plan.yaml'
-    write_plan(find_plan(window(), TARGET, bow=False), file)
-    text = file.read_text()
-    assert old in text
-    file.write_text(text.replace(old, new, 1))
-    with pytest.raises(NeedleError, match=message):
-        read_plan(file)
-    with pytest.raises(ParameterError, match='cannot be read: No such file'):
-        read_plan(tmp_path / 'none.yaml')
 
 
 def test_synthetic_liver_has_a_plan() -> None:

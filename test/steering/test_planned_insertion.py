@@ -63,7 +63,7 @@ def test_target_at_another_depth_is_rejected() -> None:
 @pytest.mark.parametrize(
     ('plan', 'settings', 'message'),
     [
-        ({}, {'guide_limit': 2e-3}, r'the plan needs guide_limit >= 2\.\d+ mm, got 2 mm'),
+        ({}, {'guide_limit': 2e-3}, r'the plan needs guide_limit >= 3\.\d+ mm, got 2 mm'),
         ({}, {'guide_step': 1e-4}, r'the plan needs guide_step >= \d\.\d+ mm, got 0\.1 mm'),
         ({}, {'continuous': True}, 'continuous must be 0 with a plan, got True'),
         ({}, {'turns': 1}, 'turns must be 0 with a plan, got 1'),

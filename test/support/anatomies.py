@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 SKIN, VESSELS, RIBS, LIVER, BOWEL = 1, 2, 3, 4, 5
+ENTRY_LABEL: Final = 9  #: Label of the entry region of `window`.
+WINDOW_TARGET: Final = np.array([0.042, 0.041, 0.006])  #: Target in `window` [m].
 
 #: Meaning of the labels of `liver`.
 STRUCTURES: Final = {
@@ -43,6 +45,23 @@ def plan_of(entry: FloatArray, direction: FloatArray, displaced: float = 0.0) ->
         clearance=3e-3, structure='bone', place=entry, bow=0.0, resolution=5e-4,
         straight_bound=3.5e-3, bound=5e-3,
     )  # fmt: skip
+
+
+def window(margin: float = 1e-3, shift: int = 0) -> Anatomy:
+    """Return voxels of 2 mm with two slabs, whose gaps are displaced by a number of voxels."""
+    labels = np.zeros((40, 40, 60), dtype=np.int16)
+    labels[:, :, 44] = labels[:, :, 24] = 1
+    labels[12:18, 16:22, 44] = 0
+    labels[16 + shift : 21 + shift, 18:23, 24] = 0
+    labels[:, :, 58] = ENTRY_LABEL
+    return Anatomy(
+        labels=labels,
+        to_patient=affine([2e-3] * 3),
+        structures={
+            1: Structure(name='bone', role='obstacle', margin=margin),
+            ENTRY_LABEL: Structure(name='skin', role='entry'),
+        },
+    )
 
 
 def center(anatomy: Anatomy, index: ArrayLike) -> FloatArray:

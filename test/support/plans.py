@@ -18,21 +18,32 @@ def bowed_plan(length: float = 0.06, steps: int = 12, bow: float = 3e-3) -> Plan
     depths = np.linspace(0.0, length, steps + 1)
     guide = np.zeros((steps, 2))
     guide[1:, 0] = bow * np.sin(np.linspace(0.3, 4.0, steps - 1))
+    ramp = np.zeros((steps, 2))
+    ramp[:, 0] = np.linspace(0.0, bow, steps)
+    # The tip is linear in the guide, and ends on the line to the target.
+    guide -= _tips(depths, guide)[-1, 0] / _tips(depths, ramp)[-1, 0] * ramp
+    guide *= bow / np.abs(guide).max()
+    tips = _tips(depths, guide)
+    entry, direction = np.array([0.1, 0.02, 0.03]), np.array([-1.0, 0.0, 0.0])
+    path = entry + tips @ guide_axes(direction)
+    return Plan(
+        needle='bending_35mm', radius=6e-4, entry=entry, direction=direction, target=path[-1],
+        roll=0.0, depths=depths, guide=guide, path=path, clearances=np.full(steps + 1, CLEARANCE),
+        clearance=CLEARANCE, structure='tube', place=path[steps // 2],
+        bow=float(np.abs(tips[:, 0]).max()), resolution=5e-4, straight_bound=0.0,
+        bound=CLEARANCE, free=tube(length, SPACE),
+    )  # fmt: skip
+
+
+def _tips(depths: FloatArray, guide: FloatArray) -> FloatArray:
+    """Return the tip of the needle at each depth [m], shape (steps + 1, 3)."""
     needle = SteeredNeedle(NEEDLE, STEERING)
     tips = [needle.tip]
     for depth, setpoint in zip(depths[1:].tolist(), guide, strict=True):
         needle.move(guide=setpoint.tolist())
         needle.move(depth=depth)
         tips.append(needle.tip)
-    entry, direction = np.array([0.1, 0.02, 0.03]), np.array([-1.0, 0.0, 0.0])
-    path = entry + np.array(tips) @ guide_axes(direction)
-    return Plan(
-        needle='bending_35mm', radius=6e-4, entry=entry, direction=direction, target=path[-1],
-        roll=0.0, depths=depths, guide=guide, path=path, clearances=np.full(steps + 1, CLEARANCE),
-        clearance=CLEARANCE, structure='tube', place=path[steps // 2],
-        bow=float(np.abs(np.array(tips)[:, 0]).max()), resolution=5e-4, straight_bound=0.0,
-        bound=CLEARANCE, free=tube(length, SPACE),
-    )  # fmt: skip
+    return np.array(tips)
 
 
 def tube(length: float, radius: float) -> FloatArray:
