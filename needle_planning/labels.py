@@ -33,6 +33,8 @@ from numpy.typing import NDArray
 _MOST: Final = 254  #: Largest number of structures.
 _SHOWN: Final = 10  #: Names in a message.
 _SAME: Final = 1e-6  #: Largest distance between corners of the same grid [m].
+_WIDEST: Final = 0.5  #: Largest plausible margin [m].
+_SOFTEST: Final = 100.0  #: Least plausible stiffness [N/m^2].
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -154,6 +156,16 @@ def _structure(where: str, name: str, given: Any) -> Structure:
     if 'stiffness' not in given and ('spread' in given or 'source' in given):
         raise ParameterError(f'{where} has a spread or a source, but no stiffness')
     entry = from_values(_Entry, given, f'{where}.')
+    if entry.margin > _WIDEST:
+        raise ParameterError(
+            f'{where}.margin is {entry.margin:g} m, at most {_WIDEST:g} is plausible: numbers '
+            'without a unit are m, write 2mm for 2 mm'
+        )
+    if 'stiffness' in given and entry.stiffness < _SOFTEST:
+        raise ParameterError(
+            f'{where}.stiffness is {entry.stiffness:g} N/m^2, at least {_SOFTEST:g} is plausible: '
+            'numbers without a unit are N/m^2, write 20kPa for 20 kPa'
+        )
     values = {key: getattr(entry, key) for key in given}
     # It may be a name of an external file, and is printed.
     return Structure(**{**values, 'name': shown(entry.name or name)})
@@ -246,6 +258,7 @@ def anatomy_of(
         if not found[key]:
             raise ParameterError(
                 f'{labels}: structures: {key} is in no segmentation; there are {_listed(names)}'
+                + _unquoted(key)
             )
         if isinstance(key, int) and found[key] > 1:
             raise ParameterError(
@@ -263,6 +276,12 @@ def anatomy_of(
     return anatomies
 
 
+def _unquoted(key: int | str) -> str:
+    """Return a hint if a label is a value in quotes."""
+    is_value = isinstance(key, str) and key.isdecimal()
+    return f'; for the value, write {key} without quotes' * is_value
+
+
 def _listed(names: Iterable[str]) -> str:
     ordered = sorted(names)
     rest = f' and {len(ordered) - _SHOWN} others' if len(ordered) > _SHOWN else ''
@@ -275,7 +294,7 @@ def _numbers(
     """Return the number of the structure of each value, and the keys that are in a layer."""
     table = np.zeros(LARGEST_VALUE + 1, np.uint8)
     used: list[int | str] = []
-    without = []
+    without, hint = [], ''
     for value, name in layer.names.items():
         keys = [key for key in (value, name) if key in labels.numbers]
         if len(keys) > 1:
@@ -284,11 +303,13 @@ def _numbers(
             )
         used += keys
         table[value] = labels.numbers[keys[0]] if keys else labels.others
-        without += [name] if not table[value] else []
+        if not table[value]:
+            without.append(name)
+            hint = hint or _unquoted(str(value)) * (str(value) in labels.numbers)
     if without:
         raise ParameterError(
             f'{source}: labels without a role: {_listed(without)}; add them to structures, or '
-            'others: {role: tissue} for all of them'
+            f'others: {{role: tissue}} for all of them{hint}'
         )
     return table, used
 

@@ -7,6 +7,7 @@ import bz2
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 import gzip
+from itertools import product
 from math import prod
 from pathlib import Path
 import re
@@ -39,10 +40,19 @@ _LONGEST: Final = 2**22  #: Largest header of NRRD [byte].
 #: Spaces of NRRD.
 _SPACES: Final = {
     'right-anterior-superior': 'RAS', 'ras': 'RAS', 'left-posterior-superior': 'LPS', 'lps': 'LPS',
+    'left-anterior-superior': 'LAS', 'las': 'LAS',
 }  # fmt: skip
 
 #: Units of length in headers [m]; unknown in NIfTI is mm, as everywhere in practice.
-_UNITS: Final = {'mm': 1e-3, 'unknown': 1e-3, 'micron': 1e-6, 'um': 1e-6, 'meter': 1.0, 'm': 1.0}
+_UNITS: Final = {
+    'mm': 1e-3, 'unknown': 1e-3, 'millimeter': 1e-3, 'cm': 1e-2, 'micron': 1e-6, 'um': 1e-6,
+    'meter': 1.0, 'm': 1.0,
+}  # fmt: skip
+
+_GZIP: Final = b'\x1f\x8b'  #: Begin of a compressed file.
+_PADDING: Final = 512  #: Largest number of zeros after the voxels of NIfTI [byte].
+_APART: Final = 1e-4  #: Largest distance of a corner between two forms of NIfTI [m].
+_PART: Final = 2**20  #: Bytes of text that are read at once.
 
 #: Types of voxels in NRRD, by NumPy type.
 _TYPES: Final = {
@@ -70,7 +80,31 @@ _ENCODINGS: Final[Mapping[str, Any]] = {
     'gz': lambda stream: gzip.GzipFile(fileobj=stream),
     'bzip2': bz2.BZ2File,
     'bz2': bz2.BZ2File,
+    'ascii': lambda stream: stream,
+    'text': lambda stream: stream,
+    'txt': lambda stream: stream,
 }
+
+
+class _Numbers:
+    """Numbers of a text as voxels of type float64, read in parts."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream, self._words, self._rest = stream, list[bytes](), b''
+
+    def read(self, size: int, /) -> bytes:
+        count = -(-size // 8)
+        while len(self._words) < count and (text := self._stream.read(_PART)):
+            # The last word may continue.
+            *words, self._rest = re.split(rb'\s+', self._rest + text)
+            self._words += filter(None, words)
+        if self._rest and len(self._words) < count:
+            self._words, self._rest = [*self._words, self._rest], b''
+        part, self._words = self._words[:count], self._words[count:]
+        try:
+            return np.array(part, dtype=np.float64).tobytes()
+        except ValueError as error:
+            raise SegmentationError(f'has voxels that are not numbers: {_line(error)}') from error
 
 
 class _Segment(NamedTuple):
@@ -142,7 +176,10 @@ def _layers(path: Path, space: str, spacing: float) -> Iterator[Layer]:
         yield from read_surfaces(surfaces, space, spacing)
         return
     if (path.exists() and not path.is_file()) or not name.endswith(ENDINGS):
-        raise SegmentationError(f'is not a folder of STL files or a file {", ".join(ENDINGS)}')
+        raise SegmentationError(
+            f'is not a folder of STL files or a file {", ".join(ENDINGS)}: save an image as NRRD '
+            'or NIfTI'
+        )
     if name.endswith('.stl'):
         yield from read_surfaces([path], space, spacing)
         return
@@ -167,10 +204,12 @@ def _nrrd(path: Path, stack: ExitStack, space: str) -> tuple[Values, FloatArray,
     """Return values of shape (layer, i, j, k), the matrix to RAS [m], and segments."""
     stream = stack.enter_context(path.open('rb'))
     header = _nrrd_header(path, stream)
+    _leave_out_single_list(header)
     shape = tuple(map(int, header['sizes']))
     check_size(shape)
     kind = np.dtype(_valid(header, 'type', _TYPES))
-    if kind.itemsize > 1:
+    is_text = str(header['encoding']).lower() in ('ascii', 'text', 'txt')
+    if kind.itemsize > 1 and not is_text:
         kind = kind.newbyteorder(_valid(header, 'endian', {'little': '<', 'big': '>'}))
     if header.get('line skip', header.get('lineskip', 0)):
         raise SegmentationError('has a line skip, which is not read')
@@ -190,8 +229,19 @@ def _nrrd(path: Path, stack: ExitStack, space: str) -> tuple[Values, FloatArray,
             f'has 4 axes ({" x ".join(map(str, shape))}): a segmentation of 3D Slicer has the '
             'fields of segments, any other has 3 axes'
         )
+    if is_text:
+        data, kind = _Numbers(data), np.dtype(np.float64)
     values = read_values(data, shape, kind, 1.0, 0.0)
     return values if is_list else values[None], matrix, segments
+
+
+def _leave_out_single_list(header: dict[str, Any]) -> None:
+    """Leave out a last axis of lists of one value, such as of one component."""
+    directions, sizes = np.asarray(header.get('space directions')), header['sizes']
+    if directions.shape != (4, 3) or len(sizes) != 4 or sizes[3] != 1:
+        return
+    if np.isnan(directions[3].astype(np.float64)).all():
+        header |= {'sizes': sizes[:3], 'space directions': directions[:3]}
 
 
 def _data_file(path: Path, header: Mapping[str, Any]) -> Path | None:
@@ -249,7 +299,7 @@ def _nrrd_matrix(header: Mapping[str, Any], axes: int, space: str) -> tuple[Floa
         raise SegmentationError(
             'does not state its space: add space: LPS or space: RAS to the labels'
         )
-    units = {str(unit) for unit in header.get('space units', ['mm'])}
+    units = {str(unit).strip() or 'unknown' for unit in header.get('space units', ['mm'])}
     if len(units) != 1:
         raise SegmentationError(f'has the space units {", ".join(sorted(units))}')
     unit = _valid({'unit': units.pop()}, 'unit', _UNITS)
@@ -277,13 +327,19 @@ def _segments(header: Mapping[str, Any], layers: int) -> list[_Segment]:
     for key in header:
         if not (match := re.fullmatch(r'(Segment(\d{1,6})_)Name', key)):
             continue
-        numbers = [header.get(f'{match[1]}{field}', '') for field in ('Layer', 'LabelValue')]
+        defaults = {'Layer': min(int(match[2]), layers - 1), 'LabelValue': 1}
         layer, value = (
-            int(text) if re.fullmatch(r'\d{1,6}', text) else default
-            for text, default in zip(numbers, (min(int(match[2]), layers - 1), 1), strict=True)
+            _whole(f'{match[1]}{field}', header.get(f'{match[1]}{field}', default))
+            for field, default in defaults.items()
         )
         found.append(_Segment(header[key], layer, value))
     return found
+
+
+def _whole(field: str, given: object) -> int:
+    if not re.fullmatch(r'\d{1,6}', str(given), re.ASCII):
+        raise SegmentationError(f'has the {field} {given!r}, valid: whole numbers from 0')
+    return int(str(given))
 
 
 def _nifti(path: Path, stack: ExitStack, _space: str) -> tuple[Values, FloatArray, list[_Segment]]:
@@ -292,7 +348,8 @@ def _nifti(path: Path, stack: ExitStack, _space: str) -> tuple[Values, FloatArra
         from nibabel import Nifti1Header, Nifti2Header
     except ModuleNotFoundError as error:
         raise missing_extra(error, f'reading {path.name}', 'plan') from error
-    opened = gzip.open if path.name.lower().endswith('.gz') else open
+    with path.open('rb') as stored:
+        opened = gzip.open if stored.read(2) == _GZIP else open
     stream = cast('BinaryIO', stack.enter_context(opened(path, 'rb')))
     block = stream.read(Nifti2Header.sizeof_hdr)
     kind = Nifti2Header if Nifti2Header.may_contain_header(block) else Nifti1Header
@@ -324,12 +381,29 @@ def _nifti(path: Path, stack: ExitStack, _space: str) -> tuple[Values, FloatArra
             'has neither sform nor qform: its left and right are unknown; save it again with its '
             'orientation'
         )
+    length = _valid({'unit': unit}, 'unit', _UNITS)
+    _check_forms(matrices, shape, length)
     if offset < kind.sizeof_hdr:
         raise SegmentationError(f'has its voxels at byte {offset}, within the header')
     stream.seek(offset)
     scale = (1.0 if slope is None else float(slope), float(intercept or 0.0))
-    values = read_values(stream, shape[:3], dtype, *scale)
-    return values[None], to_ras(matrix, 'RAS', _valid({'unit': unit}, 'unit', _UNITS)), []
+    values = read_values(stream, shape[:3], dtype, *scale, padding=_PADDING)
+    return values[None], to_ras(matrix, 'RAS', length), []
+
+
+@np.errstate(all='ignore')
+def _check_forms(matrices: list[FloatArray | None], shape: tuple[int, ...], unit: float) -> None:
+    """Raise `SegmentationError` if sform and qform place a corner at different positions."""
+    sform, qform = matrices
+    if sform is None or qform is None:
+        return
+    corners = np.array(list(product(*((0, size - 1) for size in shape[:3]))))
+    apart = np.linalg.norm(corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3], axis=1)
+    if not unit * apart.max() <= _APART:
+        raise SegmentationError(
+            f'has an sform and a qform whose corners are up to {1e3 * unit * apart.max():.4g} mm '
+            'apart: save it with one of them, and the code of the other set to 0'
+        )
 
 
 def _line(error: Exception) -> str:

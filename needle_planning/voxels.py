@@ -27,6 +27,7 @@ _CHUNK: Final = 2**20  #: Voxels that are converted at once.
 SPACES: Final[Mapping[str, tuple[float, float, float]]] = {
     'RAS': (1.0, 1.0, 1.0),
     'LPS': (-1.0, -1.0, 1.0),
+    'LAS': (-1.0, 1.0, 1.0),
 }
 
 
@@ -69,12 +70,19 @@ def check_size(shape: tuple[int, ...]) -> None:
 
 @np.errstate(all='ignore')
 def read_values(
-    stream: Readable, shape: tuple[int, ...], dtype: np.dtype, slope: float, intercept: float
+    stream: Readable,
+    shape: tuple[int, ...],
+    dtype: np.dtype,
+    slope: float,
+    intercept: float,
+    *,
+    padding: int = 0,
 ) -> Values:
     """
     Read the values of all voxels, the first index fastest; they must be whole numbers.
 
-    Values that are scaled must be whole numbers to 0.001, and are rounded.
+    Values that are scaled must be whole numbers to 0.001, and are rounded. At most `padding` zeros
+    may follow them [byte].
     """
     check_size(shape)
     if dtype.kind not in 'iuf':
@@ -102,7 +110,8 @@ def read_values(
                 f'from 0 to {LARGEST_VALUE}'
             )
         part[:] = read
-    if stream.read(1):
+    rest = stream.read(padding + 1)
+    if len(rest) > padding or any(rest):
         raise SegmentationError(f'has more than the {flat.size * size} bytes of its voxels')
     return flat.reshape(shape, order='F')
 

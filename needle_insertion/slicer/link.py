@@ -153,6 +153,8 @@ class LinkSettings:
 
     def __post_init__(self) -> None:
         check_constants(self)
+        if self.host == 'localhost':
+            object.__setattr__(self, 'host', '127.0.0.1')
         try:
             # A name lookup can block.
             IPv4Address(self.host)

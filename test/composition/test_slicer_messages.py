@@ -172,7 +172,7 @@ def test_invalid_registration_is_rejected(given_: dict[str, Any], complaint: str
     ('given_', 'complaint'),
     [
         ({'role': 'peer'}, 'role must be one of server, client'),
-        ({'host': 'localhost'}, "host must be an IPv4 address such as 127.0.0.1, got 'localhost'"),
+        ({'host': 'slicer'}, "host must be an IPv4 address such as 127.0.0.1, got 'slicer'"),
         ({'port': 0}, 'port must be finite, >= 1'),
         ({'port': 80.5}, 'port must be a whole number'),
     ],
@@ -180,6 +180,11 @@ def test_invalid_registration_is_rejected(given_: dict[str, Any], complaint: str
 def test_invalid_link_settings_are_rejected(given_: dict[str, Any], complaint: str) -> None:
     with pytest.raises(ParameterError, match=complaint):
         LinkSettings(**given_)
+
+
+def test_localhost_is_this_machine() -> None:
+    """It needs no look-up of a name, which can block."""
+    assert LinkSettings(host='localhost') == LinkSettings(host='127.0.0.1')
 
 
 # Targets.

@@ -180,12 +180,74 @@ def test_segments_of_one_image_need_no_layer(tmp_path: Path) -> None:
     assert sizes == [int(np.sum(number == IMAGE)) for number in (1, 2)]
 
 
-@pytest.mark.parametrize('encoding', ['raw', 'gzip', 'bzip2'])
+@pytest.mark.parametrize('encoding', ['raw', 'gzip', 'bzip2', 'ascii'])
 @pytest.mark.parametrize('detached', [False, True])
 def test_encodings_of_nrrd_are_the_same(encoding: str, detached: bool, tmp_path: Path) -> None:
     name = 'a.nhdr' if detached else 'a.nrrd'
     path = write_nrrd(tmp_path / name, IMAGE, LPS @ AFFINE, encoding=encoding)
     expected = read(write_nifti(tmp_path / 'b.nii', IMAGE, AFFINE))
+    np.testing.assert_array_equal(read(path).labels, expected.labels)
+
+
+@pytest.mark.parametrize('size', [1, 7, 2**20])
+def test_numbers_of_a_text_do_not_depend_on_its_parts(
+    size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A number may continue in the next part."""
+    values = IMAGE * np.uint16(1234)
+    path = write_nrrd(tmp_path / 'a.nrrd', values, LPS @ AFFINE, encoding='ascii')
+    monkeypatch.setattr('needle_planning.segmentation._PART', size)
+    labels = {1234: ROLES[1], 2468: ROLES[2]}
+    expected = read(write_nifti(tmp_path / 'b.nii', values, AFFINE), labels)
+    np.testing.assert_array_equal(read(path, labels).labels, expected.labels)
+    # Without the optional byte order, which a text does not have.
+    path.write_bytes(path.read_bytes().replace(b'endian: little\n', b''))
+    np.testing.assert_array_equal(read(path, labels).labels, expected.labels)
+
+
+@pytest.mark.parametrize(
+    ('fields', 'scale'),
+    [
+        ({'space units': ['', '', '']}, 1.0),
+        ({'space units': ['millimeter'] * 3}, 1.0),
+        ({'space units': ['cm'] * 3}, 0.1),
+        ({'space': 'left-anterior-superior'}, 1.0),
+        ({'space': 'LAS'}, 1.0),
+    ],
+)
+def test_spaces_and_units_of_nrrd(fields: dict[str, Any], scale: float, tmp_path: Path) -> None:
+    matrix = (np.diag([-1.0, 1.0, 1.0, 1.0]) if 'space' in fields else LPS) @ AFFINE
+    matrix[:3] *= scale
+    expected = read(write_nifti(tmp_path / 'b.nii', IMAGE, AFFINE))
+    found = read(write_nrrd(tmp_path / 'a.nrrd', IMAGE, matrix, **fields))
+    np.testing.assert_allclose(found.to_patient, expected.to_patient, atol=1e-8)
+    np.testing.assert_array_equal(found.labels, expected.labels)
+
+
+def test_last_axis_of_one_component_is_left_out(tmp_path: Path) -> None:
+    """With the direction none, as of images with a vector in each voxel."""
+    directions = np.vstack([(LPS @ AFFINE)[:3, :3].T, np.full(3, np.nan)])
+    path = write_nrrd(
+        tmp_path / 'a.nrrd', IMAGE[..., None], LPS @ AFFINE, **{'space directions': directions}
+    )
+    expected = read(write_nifti(tmp_path / 'b.nii', IMAGE, AFFINE))
+    np.testing.assert_array_equal(read(path).labels, expected.labels)
+
+
+@pytest.mark.parametrize(('name', 'other'), [('a.nii', 'b.nii.gz'), ('a.nii.gz', 'b.nii')])
+def test_name_of_nifti_does_not_state_its_compression(
+    name: str, other: str, tmp_path: Path
+) -> None:
+    path = write_nifti(tmp_path / name, IMAGE, AFFINE)
+    expected = read(path)
+    np.testing.assert_array_equal(read(path.rename(tmp_path / other)).labels, expected.labels)
+
+
+@pytest.mark.parametrize('count', [1, 16, 512])
+def test_zeros_after_the_voxels_of_nifti_are_left_out(count: int, tmp_path: Path) -> None:
+    path = write_nifti(tmp_path / 'a.nii', IMAGE, AFFINE)
+    expected = read(path)
+    path.write_bytes(path.read_bytes() + bytes(count))
     np.testing.assert_array_equal(read(path).labels, expected.labels)
 
 
@@ -219,18 +281,31 @@ def test_space_that_a_file_does_not_state_is_in_the_labels(space: str, tmp_path:
     np.testing.assert_array_equal(anatomy.to_patient, other.to_patient)
 
 
-def test_form_of_nifti_is_sform_before_qform(tmp_path: Path) -> None:
-    """A file without sform is read with its qform; without both, left and right are unknown."""
-    shifted = AFFINE.copy()
-    shifted[0, 3] += 5.0
+def test_sform_and_qform_of_nifti_are_the_same_or_one_of_them(tmp_path: Path) -> None:
+    """A file with two is read if they are alike to 0.1 mm; other programs use the other one."""
+    turned = AFFINE.copy()
+    # The farthest corner is moved by an angle times its distance from the axis, 3 mm and 8 mm.
+    turned[:3, :3] = Rotation.from_euler('x', 0.05).as_matrix() @ AFFINE[:3, :3]
+    shifted = AFFINE + 5.0 * np.eye(4, k=3)
     image = nibabel.Nifti1Image(IMAGE, AFFINE)
     found = {}
-    for sform, qform in ((1, 1), (0, 1), (1, 0)):
+    for sform, qform in ((0, 1), (1, 0)):
         image.set_sform(AFFINE, sform)
         image.set_qform(shifted, qform)
         nibabel.save(image, tmp_path / 'a.nii')
         found[sform, qform] = 1e3 * read(tmp_path / 'a.nii').to_patient[0, 3]
-    assert found == pytest.approx({(1, 1): -40.0, (0, 1): -35.0, (1, 0): -40.0})
+    assert found == pytest.approx({(0, 1): -35.0, (1, 0): -40.0})
+    for other, apart in ((shifted, 5.0), (turned, 0.05 * np.hypot(4 * 2.0, 5 * 3.0))):
+        image.set_sform(AFFINE, 1)
+        image.set_qform(other, 1)
+        nibabel.save(image, tmp_path / 'a.nii')
+        with pytest.raises(SegmentationError, match='set to 0') as error:
+            read(tmp_path / 'a.nii')
+        stated = float(str(error.value).partition(' are up to ')[2].partition(' mm')[0])
+        assert stated == pytest.approx(apart, rel=1e-3)
+    image.set_qform(AFFINE + 0.05 * np.eye(4, k=3), 1)
+    nibabel.save(image, tmp_path / 'a.nii')
+    assert 1e3 * read(tmp_path / 'a.nii').to_patient[0, 3] == pytest.approx(-40.0)
     with pytest.raises(SegmentationError, match='has neither sform nor qform'):
         read(write_nifti(tmp_path / 'b.nii', IMAGE, AFFINE, sform=0, qform=0))
 
