@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import ceil
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -68,7 +69,7 @@ def write_plan_page(
     chance: Chance | None = None,
 ) -> None:
     """
-    Write the page of a plan, and its pictures in the same folder.
+    Write the page of a plan, and its pictures, which have its name, in the same folder.
 
     Parameters
     ----------
@@ -97,8 +98,12 @@ def write_plan_page(
     shaft = _shaft(plan, clearance, chance)
     pictures = [
         _picture(plan, legend, shaft, name, section(every, legend, clearance, plan.radius, one))
-        for name, one in zip(('plan_x', 'plan_z', 'plan_across'), planes, strict=True)
+        for name, one in zip(('x', 'z', 'across'), planes, strict=True)
     ]
+    pictures.append(_by_depth(plan, legend, shaft))
+    # Two pages in a folder have their own pictures.
+    pictures = [replace(one, name=f'{Path(path).stem}_{one.name}') for one in pictures]
+    *sections, depth = pictures
     near = f'to {plan.structure}' if plan.structure else 'to all obstacles'
     least = 'at least ' * plan.at_limit + _mm(plan.clearance)
     bent = plan.guide.any()
@@ -109,7 +114,7 @@ def write_plan_page(
     write_page(
         Path(path),
         'plan.html',
-        [*pictures, _by_depth(plan, legend, shaft)],
+        pictures,
         AnatomyView(words, plan, every, chance),
         introduction=f'Needle {plan.needle} from the skin to the target, '
         f'{"bowed by the guide" if bent else "straight"}, in {len(plan.guide)} steps. '
@@ -122,7 +127,8 @@ def write_plan_page(
             *([] if chance is None else [('Success', *chance.rows()[-1][1:])]),
         ],
         chances=[] if chance is None else chance.rows(),
-        sections=pictures,
+        sections=sections,
+        depth=depth,
         guide='The guide is at zero until the needle has pierced the skin. It moves to the '
         'setpoint of a step while the needle rests, and rests while the needle is inserted.'
         if bent
@@ -231,7 +237,7 @@ def _shaft(plan: Plan, clearance: Clearance, chance: Chance | None = None) -> _S
 def _picture(plan: Plan, legend: Legend, shaft: _Shaft, name: str, shown: Section) -> Picture:
     from matplotlib.figure import Figure
 
-    plane, across = shown.plane, name == 'plan_across'
+    plane, across = shown.plane, name == 'across'
     wide, tall = plane.high - plane.low
     width = (0.6 if across else 0.88) * _WIDTH
     drawing = Figure(figsize=(_WIDTH, width * tall / wide))
@@ -419,4 +425,4 @@ def _by_depth(plan: Plan, legend: Legend, shaft: _Shaft) -> Picture:
     count = _legend(rows[0], entries, 'lower center', bbox_to_anchor=(0.5, 1.0))
     drawing.set_figheight(drawing.get_figheight() + 0.18 * count)
     rows[-1].set(xlabel='depth [mm]', xlim=(0.0, depths[-1]))
-    return Picture('plan_depth', words, drawing)
+    return Picture('depth', words, drawing)

@@ -370,6 +370,20 @@ def test_command_writes_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert all(one in seen for one in entry)
 
 
+def test_pages_of_a_folder_have_their_own_pictures(
+    straight: Plan, anatomy: Anatomy, tmp_path: Path
+) -> None:
+    """The pictures of the first page remain."""
+    names = 'across', 'depth', 'x', 'z'
+    plan_page.write_plan_page(straight, anatomy, tmp_path / 'plan.html')
+    assert sorted(one.stem for one in tmp_path.glob('*.png')) == [f'plan_{one}' for one in names]
+    before = {one: one.read_bytes() for one in tmp_path.iterdir()}
+    plan_page.write_plan_page(replace(straight, roll=0.1), anatomy, tmp_path / 'other.html')
+    added = sorted(one.stem for one in {*tmp_path.glob('*.png')} - before.keys())
+    assert added == [f'other_{one}' for one in names]
+    assert all(one.read_bytes() == content for one, content in before.items())
+
+
 def test_names_are_shown_as_they_are(straight: Plan, anatomy: Anatomy, tmp_path: Path) -> None:
     plan_page.write_plan_page(straight, anatomy, tmp_path / 'plan.html')
     seen = look_at(tmp_path / 'plan.html').text
