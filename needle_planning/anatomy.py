@@ -55,6 +55,7 @@ class Anatomy:
     labels: NDArray[np.integer]  #: label of each voxel, shape (i, j, k)
     to_patient: FloatArray  #: from voxel indices (center of the voxel) to patient, shape (4, 4)
     structures: Mapping[int, Structure]  #: by label
+    closed: bool = False  #: structures are closed surfaces: none continues outside of the voxels
 
     def __post_init__(self) -> None:
         if self.labels.ndim != 3 or not self.labels.size or self.labels.dtype.kind not in 'iu':
@@ -141,16 +142,13 @@ def covered(anatomies: Iterable[Anatomy], entry: FloatArray, direction: FloatArr
     for anatomy in anatomies:
         to_index = np.linalg.inv(anatomy.to_patient)
         step = to_index[:3, :3] @ -direction
-        shape = np.array(anatomy.labels.shape)
         first = to_index[:3, :3] @ entry + to_index[:3, 3]
         # No point in the image is further away than all edges together and the first point.
-        far = (np.abs(first) + shape).sum() / np.linalg.norm(step)
-        index = np.rint(first + np.outer(np.arange(0.0, far, _ALONG), step)).astype(int)
-        index = index[((index >= 0) & (index < shape)).all(axis=1)]
-        found = anatomy.labels[tuple(index.T)]
+        far = (np.abs(first) + anatomy.labels.shape).sum() / np.linalg.norm(step)
+        found = _labels_along(anatomy, entry, -direction, far)
         inside = np.isin(found, list(anatomy.structures))
         length = _ALONG * np.count_nonzero(inside)
-        if length * np.abs(step).max() > _VOXELS:
+        if _is_visible(anatomy, direction, length):
             most = max(most, length)
             names |= dict.fromkeys(anatomy.structures[one].name for one in found[inside].tolist())
     through = ' and '.join(names)
@@ -159,9 +157,93 @@ def covered(anatomies: Iterable[Anatomy], entry: FloatArray, direction: FloatArr
     ) * bool(names)
 
 
+def _labels_along(
+    anatomy: Anatomy, entry: FloatArray, direction: FloatArray, length: float
+) -> NDArray[np.int64]:
+    """Return the labels of points from an entry point on, -1 outside of the image."""
+    to_index = np.linalg.inv(anatomy.to_patient)
+    points = entry + np.outer(np.arange(0.0, length, _ALONG), direction)
+    index = np.rint(points @ to_index[:3, :3].T + to_index[:3, 3]).astype(int)
+    inside = ((index >= 0) & (index < anatomy.labels.shape)).all(axis=1)
+    found = np.full(len(index), -1)
+    found[inside] = anatomy.labels[tuple(index[inside].T)]
+    return found
+
+
+def _is_visible(anatomy: Anatomy, direction: FloatArray, length: float) -> bool:
+    """Return whether a length [m] is larger than the accuracy of the voxels."""
+    step = np.linalg.solve(anatomy.to_patient[:3, :3], direction)
+    return bool(length * np.abs(step).max() > _VOXELS)
+
+
+def before_tissue(
+    anatomies: Sequence[Anatomy], target: FloatArray, entry: FloatArray, direction: FloatArray
+) -> str:
+    """
+    Return a warning of a length in no structure after an entry point.
+
+    Parameters
+    ----------
+    anatomies : sequence of Anatomy
+        Images in the same patient coordinates.
+    target, entry : ndarray, shape (3,)
+        Ends of the needle in patient coordinates [m].
+    direction : ndarray, shape (3,)
+        Direction of the insertion, a unit vector.
+
+    Returns
+    -------
+    str
+        The length; empty to the size of the voxels, and for images without tissue and entry
+        region, which do not state where the patient begins.
+
+    """
+    length = float(np.linalg.norm(target - entry))
+    every = [one for anatomy in anatomies for one in anatomy.structures.values()]
+    if not any(one.role in ('tissue', 'entry') for one in every):
+        return ''
+    known = np.any(
+        [
+            np.isin(_labels_along(one, entry, direction, length), list(one.structures))
+            for one in anatomies
+        ],
+        axis=0,
+    )
+    first = _ALONG * float(np.append(known, True).argmax())
+    return (
+        f'the needle is in no structure for {1e3 * first:.1f} mm after the entry point, which may '
+        'be outside of the patient'
+    ) * all(_is_visible(one, direction, first) for one in anatomies)
+
+
+def outside(
+    anatomies: Iterable[Anatomy], target: FloatArray, entry: FloatArray, direction: FloatArray
+) -> list[str]:
+    """
+    Return warnings of lengths outside of each image with obstacles, to the size of its voxels.
+
+    Closed surfaces have no further obstacles. The parameters are those of `before_tissue`.
+    """
+    lines, length = [], float(np.linalg.norm(target - entry))
+    for anatomy in anatomies:
+        names = [one.name for one in anatomy.structures.values() if one.role == 'obstacle']
+        away = _ALONG * np.count_nonzero(_labels_along(anatomy, entry, direction, length) < 0)
+        if names and not anatomy.closed and _is_visible(anatomy, direction, away):
+            lines.append(
+                f'{1e3 * away:.1f} mm of the needle are outside of the image with '
+                f'{" and ".join(names)}, where further obstacles are unknown'
+            )
+    return lines
+
+
 def plan_warnings(
     anatomies: Sequence[Anatomy], target: FloatArray, entry: FloatArray, direction: FloatArray
 ) -> list[str]:
-    """Return the lines of `beside` and `covered` that are not empty."""
-    lines = beside(anatomies, target), covered(anatomies, entry, direction)
+    """Return the lines of `beside`, `covered`, `before_tissue` and `outside`."""
+    lines = [
+        beside(anatomies, target),
+        covered(anatomies, entry, direction),
+        before_tissue(anatomies, target, entry, direction),
+        *outside(anatomies, target, entry, direction),
+    ]
     return [one for one in lines if one]

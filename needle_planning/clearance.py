@@ -105,6 +105,11 @@ class Clearance:
         points = np.atleast_2d(np.asarray(region, dtype=np.float64))
         self._grids = [_Grid(one, points, radius, beyond) for one in anatomies]
 
+    @property
+    def unused(self) -> list[int]:
+        """Numbers of the images without a voxel in the region or near it."""
+        return [number for number, one in enumerate(self._grids) if one.is_empty]
+
     def at(self, points: ArrayLike) -> FloatArray:
         """Return the clearance of points in patient coordinates, shape (k, 3) [m]; shape (k,)."""
         given = np.asarray(points, dtype=np.float64)
@@ -184,6 +189,7 @@ class _Grid:
         low = np.ceil((self._low - away) / frame.spacing - 0.5).clip(0, shape).astype(int)
         high = np.floor((self._high + away) / frame.spacing + 1.5).clip(low, shape).astype(int)
         part = anatomy.labels[tuple(map(slice, low, high))]
+        self.is_empty = not part.size
         labels = [label for label, _ in self._obstacles]
         first, last, kinds = _boxes(part, labels)
         region = np.stack([low - 0.5, low + part.shape - 0.5]) * frame.spacing

@@ -320,6 +320,7 @@ class _Painted:
 
     labels: NDArray[np.uint8]  #: shape (i, j, k)
     to_patient: FloatArray  #: shape (4, 4)
+    closed: bool  #: as of `Layer`
 
     @classmethod
     def empty(cls, layer: Layer, others: int) -> _Painted:
@@ -328,10 +329,10 @@ class _Painted:
             raise SegmentationError(
                 f'the grids have more than {2 * MOST_VOXELS} voxels: crop or resample them'
             )
-        return cls(np.zeros_like(layer.values, np.uint8), layer.to_patient)
+        return cls(np.zeros_like(layer.values, np.uint8), layer.to_patient, layer.closed)
 
     def has_grid_of(self, layer: Layer) -> bool:
-        if self.labels.shape != layer.values.shape:
+        if self.labels.shape != layer.values.shape or self.closed != layer.closed:
             return False
         # The distance between two grids is largest at a corner.
         ends = np.array(np.meshgrid(*[(0, size - 1) for size in self.labels.shape]))
@@ -349,4 +350,6 @@ class _Painted:
 
     def anatomy(self, structures: Mapping[int, Structure]) -> Anatomy:
         here = {number: structures[number] for number in present(self.labels)}
-        return Anatomy(labels=self.labels, to_patient=self.to_patient, structures=here)
+        return Anatomy(
+            labels=self.labels, to_patient=self.to_patient, structures=here, closed=self.closed
+        )

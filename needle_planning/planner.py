@@ -193,6 +193,13 @@ class _Planner:
             radius=self.radius,
             beyond=region.radius + 2.0 * limits.guide_limit,
         )
+        for number in self.clearance.unused:
+            names = (one.name for one in anatomies[number].structures.values())
+            raise ParameterError(
+                f'the image with {" and ".join(names)} is away from the entry points and the '
+                f'target: its corners are within {_corners(anatomies[number])} mm; check its '
+                'coordinates, or leave it out'
+            )
         self.at_target = at_target = float(self.clearance.at(self.target[np.newaxis])[0])
         if at_target <= 0.0:
             name = self.clearance.structure_at(self.target)
@@ -405,19 +412,30 @@ def _usable(name: str) -> NeedlePreset:
 
 
 def _check_inside(anatomies: Sequence[Anatomy], target: FloatArray) -> None:
-    shown = []
-    for anatomy in anatomies:
-        frame, shape = image_frame(anatomy), np.array(anatomy.labels.shape)
-        index = frame.of_patient(target) / frame.spacing
-        if (index >= -0.5).all() and (index <= shape - 0.5).all():
-            return
-        corners = frame.to_patient((np.indices((2, 2, 2)).T * shape - 0.5) * frame.spacing)
-        ends = zip(corners.min(axis=(0, 1, 2)), corners.max(axis=(0, 1, 2)), strict=True)
-        shown.append(', '.join(f'{1e3 * a:.2f} to {1e3 * b:.2f}' for a, b in ends))
+    if any(_contains(one, target) for one in anatomies):
+        return
     at = ', '.join(f'{1e3 * one:.2f}' for one in target)
+    corners = '; '.join(map(_corners, anatomies))
+    hint = ''
+    if any(_contains(one, 1e-3 * target) for one in anatomies):
+        hint = f'; numbers without a unit are m: {",".join(f"{one:g}mm" for one in target)}'
     raise ParameterError(
-        f'the target {at} mm is outside the image, whose corners are within {"; ".join(shown)} mm'
+        f'the target {at} mm is outside the image, whose corners are within {corners} mm{hint}'
     )
+
+
+def _contains(anatomy: Anatomy, point: FloatArray) -> bool:
+    frame, shape = image_frame(anatomy), np.array(anatomy.labels.shape)
+    index = frame.of_patient(point) / frame.spacing
+    return bool((index >= -0.5).all() and (index <= shape - 0.5).all())
+
+
+def _corners(anatomy: Anatomy) -> str:
+    """Return the ranges of the corners of an image [mm]."""
+    frame, shape = image_frame(anatomy), np.array(anatomy.labels.shape)
+    corners = frame.to_patient((np.indices((2, 2, 2)).T * shape - 0.5) * frame.spacing)
+    ends = zip(corners.min(axis=(0, 1, 2)), corners.max(axis=(0, 1, 2)), strict=True)
+    return ', '.join(f'{1e3 * a:.2f} to {1e3 * b:.2f}' for a, b in ends)
 
 
 def _region(

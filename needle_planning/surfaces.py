@@ -42,7 +42,7 @@ def read_surfaces(paths: Sequence[Path], space: str, spacing: float) -> Iterator
                 f'{path.name} encloses no voxel of {1e3 * spacing:g} mm: its extent is '
                 f'{1e3 * extent:.3g} mm, read in mm as all STL files; reduce spacing, or scale it'
             )
-        yield Layer(inside.view(np.uint8), matrix, {1: path.stem})
+        yield Layer(inside.view(np.uint8), matrix, {1: path.stem}, closed=True)
 
 
 def _triangles(path: Path, space: str) -> FloatArray:

@@ -45,6 +45,7 @@ class Layer(NamedTuple):
     values: Values  #: shape (i, j, k), axes nearest to x, y, z of the patient
     to_patient: FloatArray  #: from voxel indices to RAS [m], shape (4, 4)
     names: Mapping[int, str]  #: by value; every value but 0
+    closed: bool = False  #: of a closed surface, which does not continue outside of the grid
 
 
 @np.errstate(all='ignore')

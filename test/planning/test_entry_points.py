@@ -93,3 +93,73 @@ def test_obstacle_outside_of_an_entry_point_is_named() -> None:
 def test_target_and_obstacle_are_no_entry(name: str, role: str) -> None:
     with pytest.raises(ParameterError, match=f'entry: {name} has the role {role}: no needle'):
         find_plan(body(), TARGET, entry=name)
+
+
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+@pytest.mark.parametrize('away', [0.003, 0.05, 0.4])
+@pytest.mark.parametrize('slope', [0.0, 0.5])
+def test_entry_point_outside_of_the_patient_has_its_distance(away: float, slope: float) -> None:
+    """Also outside of the image, which ends 10 mm above the body."""
+    direction = np.array([slope, 0.0, -1.0]) / np.hypot(1.0, slope)
+    entry = np.array([0.03, 0.03, 0.0595]) + away / direction[2] * direction
+    lines = plan_warnings([body()], TARGET, entry, direction)
+    (line,) = [one for one in lines if 'in no structure for' in one]
+    stated = float(line.partition(' for ')[2].partition(' mm')[0])
+    assert stated == pytest.approx(1e3 * away * np.hypot(1.0, slope), abs=0.11)
+    assert line.endswith('after the entry point, which may be outside of the patient')
+
+
+def test_entry_point_of_images_without_tissue_is_not_examined() -> None:
+    """Only obstacles and a target do not state where the patient begins."""
+    anatomy = body()
+    obstacles = {label: anatomy.structures[label] for label in (VEIN, TUMOR)}
+    entry = np.array([0.03, 0.03, 0.05])
+    found = plan_warnings([replace(anatomy, structures=obstacles)], TARGET, entry, DOWN)
+    assert found == []
+
+
+@pytest.mark.parametrize('low', [25, 40, 59])
+def test_needle_outside_of_an_image_with_obstacles_has_its_length(low: int) -> None:
+    """A closed surface has no further obstacles, and an image without obstacles says nothing."""
+    anatomy, entry = body(), np.array([0.03, 0.03, 0.0595])
+    part = replace(
+        anatomy,
+        labels=anatomy.labels[:, :, low:],
+        to_patient=affine([1e-3] * 3, origin=[0.0, 0.0, 1e-3 * low]),
+        structures={VEIN: anatomy.structures[VEIN]},
+    )
+    lines = plan_warnings([anatomy, part], TARGET, entry, DOWN)
+    (line,) = [one for one in lines if 'image with vein' in one]
+    # The lower face of the image is half a voxel below the center of its first voxel.
+    assert float(line.partition(' mm')[0]) == pytest.approx(low - 0.5 - 20.0, abs=0.11)
+    for other in (
+        replace(part, closed=True),
+        replace(part, structures={VEIN: Structure(name='vein', role='tissue')}),
+    ):
+        assert plan_warnings([anatomy, other], TARGET, entry, DOWN) == []
+
+
+@pytest.mark.parametrize('axis', [0, 1, 2])
+@pytest.mark.parametrize('shift', [0.2, 3.0, -3.0])
+def test_image_away_from_the_plan_is_rejected(axis: int, shift: float) -> None:
+    """It would be used without any effect; a shift that keeps it near the plan is accepted."""
+    anatomy = body()
+    for part, refused in ((1.0, True), (0.02 / abs(shift), False)):
+        moved = anatomy.to_patient.copy()
+        moved[axis, 3] += part * shift
+        second = replace(anatomy, to_patient=moved, structures={VEIN: anatomy.structures[VEIN]})
+        if refused:
+            with pytest.raises(ParameterError, match='the image with vein is away from the entry'):
+                find_plan([anatomy, second], TARGET, bow=False)
+        else:
+            find_plan([anatomy, second], TARGET, bow=False)
+
+
+def test_target_in_m_that_would_be_inside_in_mm_has_a_hint() -> None:
+    with pytest.raises(ParameterError, match=r'numbers without a unit are m: 30mm,30mm,20mm$'):
+        find_plan(body(), 1e3 * TARGET)
+    with pytest.raises(ParameterError, match='is outside the image') as error:
+        find_plan(body(), 1e4 * TARGET)
+    assert 'unit' not in str(error.value)
