@@ -59,30 +59,32 @@ class Frame(NamedTuple):
     kind: str
     device: str
     data: bytes | bytearray
+    error: str = ''  #: reason why the message is not complete
 
 
 class Frames:
     """
-    Splitter of a byte stream into messages; `refuse` reports too large ones.
+    Splitter of a byte stream into messages; too large ones have an error in place of their data.
 
     `largest` returns the largest accepted body of a type and a device [bytes], 0 to skip it.
     """
 
-    def __init__(
-        self, largest: Callable[[str, str], int], refuse: Callable[[str], object]
-    ) -> None:
-        self._largest, self._refuse = largest, refuse
+    def __init__(self, largest: Callable[[str, str], int]) -> None:
+        self._largest = largest
         self._rest = bytearray()
         self._skip = 0
         #: Size with which the next message is complete, and its type and device.
-        self._whole, self._next = 0, ''
+        self._whole, self._next = 0, ('', '')
 
     @property
-    def incomplete(self) -> str:
-        """State of a message that is larger than a target and incomplete, empty without one."""
-        if self._whole <= HEADER.size + LARGEST:
-            return ''
-        return f'{self._next} has {len(self._rest)} of {self._whole} bytes'
+    def is_large(self) -> bool:
+        """Whether a message is incomplete that is larger than a target."""
+        return self._whole > HEADER.size + LARGEST
+
+    def lost(self) -> list[Frame]:
+        """Return the incomplete message, if any, with the error that its end is lost."""
+        received = f'{len(self._rest)} of {self._whole} bytes received'
+        return [Frame(*self._next, b'', f'connection lost, {received}')] * bool(self._whole)
 
     def take(self, data: bytes) -> list[Frame]:
         """Return the messages completed by further bytes; `MessageError` if not OpenIGTLink."""
@@ -101,13 +103,11 @@ class Frames:
             if not largest:
                 self._skip = whole
             elif size > largest:
-                what = 'target' if largest == LARGEST else 'segmentation'
-                self._refuse(
-                    f'{what} refused: a {kind} message of {size} bytes, {largest} at most'
-                )
+                reason = f'a {kind} message of {size} bytes, {largest} at most'
+                found.append(Frame(kind, device, b'', reason))
                 self._skip = whole
             elif len(stream) - at < whole:
-                self._whole, self._next = whole, f'{kind} {device}'
+                self._whole, self._next = whole, (kind, device)
                 break
             elif size > LARGEST:
                 # Not copied.
@@ -184,7 +184,9 @@ class Connection:
         self._listener: socket.socket | None = None
         #: The connection, established or in progress.
         self._socket: socket.socket | None = None
-        self._frames = Frames(largest, events.reject)
+        self._frames = Frames(largest)
+        #: Message that a lost connection left incomplete, until it is returned.
+        self._lost: list[Frame] = []
         self._out = bytearray()
         #: Times of the last byte that the peer accepted, and of the last attempt to connect.
         self._moved = self._tried = -_RETRY
@@ -201,7 +203,11 @@ class Connection:
         return self.error or f'{verb} {self.place}'
 
     def poll(self) -> list[Frame]:
-        """Restore the connection if necessary, send queued data, and return received messages."""
+        """
+        Restore the connection if necessary, send queued data, and return received messages.
+
+        Accepted messages that are too large, or lost with the connection, have an error.
+        """
         found = self._read() if self.peer else []
         if self._settings.role == 'server':
             self._listen()
@@ -209,7 +215,8 @@ class Connection:
         elif not self.peer:
             self._connect()
         self._flush()
-        return found
+        lost, self._lost = self._lost, []
+        return found + lost
 
     def send(self, message: bytes) -> bool:
         """Queue a message (header and body); False without a peer or with a full queue."""
@@ -325,7 +332,7 @@ class Connection:
         found: list[Frame] = []
         left, end = _MOST_READ, self._steady() + _LONGEST_READ
         while self._socket is not None:
-            is_large = bool(self._frames.incomplete)
+            is_large = self._frames.is_large
             if left <= 0 and not (is_large and self._steady() < end):
                 break
             try:
@@ -363,8 +370,7 @@ class Connection:
             self._moved = self._steady()
 
     def _lose(self, why: str) -> None:
-        if incomplete := self._frames.incomplete:
-            self._events.reject(f'segmentation refused: connection lost, {incomplete}')
+        self._lost += self._frames.lost()
         self._events.add(Severity.WARNING, f'{self.peer} is gone: {why}', 'gone')
         self._drop()
 
@@ -372,7 +378,7 @@ class Connection:
         if self._socket is not None:
             self._socket.close()
         self._socket, self.peer = None, ''
-        self._frames = Frames(self._largest, self._events.reject)
+        self._frames = Frames(self._largest)
         self._out.clear()
 
 

@@ -37,6 +37,14 @@ from pyigtl.messages import (
 #: Name of the target: a point name in any POINT message, or a device name.
 TARGET: Final = 'TARGET'
 SEGMENTATION: Final = 'SEGMENTATION'  #: device name of a label map
+#: Messages that are accepted, in words.
+ACCEPTED: Final = (
+    f'a target is a point named {TARGET} in a POINT, or a POINT, TRANSFORM, POSITION or STRING of '
+    f'the device {TARGET}; with planning.labels, a label map is an IMAGE of the device '
+    f'{SEGMENTATION}'
+)
+#: Types that may be meant as a target or as a label map.
+TYPES: Final = 'POINT', 'TRANSFORM', 'POSITION', 'STRING', 'IMAGE'
 
 #: Device names of transmitted messages.
 SHAPE: Final = 'NeedleShapeZ'
@@ -54,6 +62,12 @@ _ROUNDING: Final = 1e-4
 #: Sizes of the extended header, of entries and texts of metadata; number of the message.
 _EXTENDED: Final = struct.Struct('>HHII')
 
+#: Position, and size of the body with the orientation: none, three or four numbers [bytes].
+_POSITION: Final = struct.Struct('>3f')
+_POSITION_SIZES: Final = 12, 24, 28
+
+_RIGID: Final = 1e-3  #: tolerance of the rotation in a TRANSFORM
+
 _STRING: Final = struct.Struct('>HH')  #: encoding of a STRING, and size of its text [bytes]
 
 _PART: Final = 1 << 20  #: part of a body whose checksum is computed at once [bytes]
@@ -70,7 +84,8 @@ _NOT_UNDERSTOOD: Final = (struct.error, ValueError, TypeError, IndexError)
 
 def largest_target(kind: str, device: str) -> int:
     """Return the largest body of a message that can contain a target [bytes], 0 for others."""
-    is_target = kind == 'POINT' or (device == TARGET and kind in ('TRANSFORM', 'STRING'))
+    named = device == TARGET and kind in ('TRANSFORM', 'POSITION', 'STRING')
+    is_target = kind == 'POINT' or named
     return LARGEST if is_target else 0
 
 
@@ -143,7 +158,7 @@ class Interpreter:
 
 def target_in_images(frame: Frame) -> FloatArray | None:
     """Return the target in the frame of the images [mm] or None; `MessageError` if invalid."""
-    found = _coordinates(_message(frame))
+    found = _position(frame) if frame.kind == 'POSITION' else _coordinates(_message(frame))
     if found is None:
         return None
     at = np.array(found, dtype=np.float64)
@@ -184,6 +199,8 @@ def _millimeters(at: FloatArray) -> str:
 
 def _checked_body(frame: Frame) -> memoryview:
     """Return the body of a message; pyigtl does not verify the checksum."""
+    if frame.error:
+        raise MessageError(frame.error)
     body, checksum = memoryview(frame.data)[HEADER.size :], 0
     # In parts, between which other threads run.
     for start in range(0, len(body), _PART):
@@ -233,9 +250,35 @@ def _check_string(content: bytes) -> None:
         raise MessageError(f'it states {size} bytes of text, and has {there}')
 
 
+def _position(frame: Frame) -> tuple[float, ...]:
+    """Return the coordinates of a POSITION, which pyigtl reads in another format."""
+    body = _checked_body(frame)
+    version, *_ = HEADER.unpack(frame.data[: HEADER.size])
+    content = _content(version, body)
+    if len(content) not in _POSITION_SIZES:
+        sizes = ', '.join(map(str, _POSITION_SIZES))
+        raise MessageError(f'a POSITION has one of {sizes} bytes, got {len(content)}')
+    return _POSITION.unpack_from(content)
+
+
+@np.errstate(all='ignore')
+def _check_rigid(matrix: FloatArray) -> None:
+    """Raise `MessageError` unless a matrix is a rotation, without scale and reflection."""
+    turn = matrix[:3, :3]
+    if not np.isfinite(turn).all():
+        raise MessageError('the matrix of a TRANSFORM must be finite')
+    if not (np.abs(turn.T @ turn - np.eye(3)).max() <= _RIGID and np.linalg.det(turn) > 0.0):
+        sizes = ', '.join(f'{one:.4g}' for one in np.linalg.norm(turn, axis=0))
+        raise MessageError(
+            f'the matrix of a TRANSFORM must be a rotation to {_RIGID:g}, got columns of length '
+            f'{sizes} and the determinant {np.linalg.det(turn):.4g}: remove scale and reflection'
+        )
+
+
 def _coordinates(message: Any) -> Any:
     """Return the coordinates of the target in a message, None without a target."""
     if isinstance(message, TransformMessage):
+        _check_rigid(message.matrix)
         return message.matrix[:3, 3]
     if isinstance(message, StringMessage):
         # Python reads 8_0 as 80, and digits of other scripts.

@@ -65,7 +65,7 @@ class SlicerPlanner:
     Parameters
     ----------
     settings : SlicerPlanSettings
-        Settings with a file of labels, which is read here.
+        Settings with a file of labels, which is read here and for each segmentation.
     read : callable
         Reads the label map of a message; NeedleError if it is invalid.
     events : EventLog
@@ -85,12 +85,13 @@ class SlicerPlanner:
         shape: PlannedShape | None = None,
         start: StartJob = ThreadJob,
     ) -> None:
-        self.state = _WAITING  #: One line for users.
+        #: Line about the inputs and the last plan, and why the last target was refused.
+        self._line, self._refused = _WAITING, ''
         self.shape = shape  #: Needle of the last plan, None after a failure.
         #: Whether a peer may show a needle that is not of the newest inputs.
         self._shown = shape is not None
         self._settings, self._read, self._events, self._start = settings, read, events, start
-        self._labels = read_labels(settings.labels)
+        read_labels(settings.labels)
         #: Newest segmentation, until it is read, and then its anatomies.
         self._frame: Frame | None = None
         self._anatomies: tuple[Anatomy, ...] = ()
@@ -99,6 +100,11 @@ class SlicerPlanner:
         self._planned = False
         self._job: tuple[Job[Any], Callable[[Job[Any]], None]] | None = None
 
+    @property
+    def state(self) -> str:
+        """One line for users."""
+        return '; '.join(filter(None, (self._refused, self._line)))
+
     def take_segmentation(self, frame: Frame) -> None:
         """Replace the segmentation."""
         self._frame, self._anatomies, self._planned = frame, (), False
@@ -106,12 +112,23 @@ class SlicerPlanner:
 
     def take_target(self, position: FloatArray) -> None:
         """Replace the target: position in the images, shape (3,) [mm]."""
-        self._target, self._planned = position, False
+        self._target, self._planned, self._refused = position, False, ''
         # Without anatomies, a job reads the segmentation.
         if self._anatomies:
             self.close()
         elif self._job is None and self._frame is None:
             self._report(f'{_words(position)}; waits for the label map SEGMENTATION')
+
+    def refuse_target(self, reason: str) -> None:
+        """Discard the target, because the next one is invalid."""
+        if self._anatomies:
+            self.close()
+            self._line = 'waits for a target'
+        elif self._target is not None:
+            self._line = _WAITING
+        self._target = None
+        self._refused = printable(self._failed(f'target refused: {reason}'))
+        self._events.reject(self._refused)
 
     def poll(self) -> None:
         """End the job that is done, and start the next one."""
@@ -134,8 +151,10 @@ class SlicerPlanner:
             self._report('reads the segmentation')
 
             def read(_: Progress) -> tuple[Anatomy, ...]:
+                # The user may have corrected it.
+                labels = read_labels(self._settings.labels)
                 layers = [(frame.device, self._read(frame))]
-                return anatomy_of(layers, self._labels, self._settings.labels)
+                return anatomy_of(layers, labels, self._settings.labels)
 
             self._job = self._start(read), self._end_reading
         elif anatomies and target is not None and not self._planned:
@@ -167,8 +186,8 @@ class SlicerPlanner:
         try:
             self._anatomies = job.result()
         except (NeedleError, MemoryError) as error:
-            self.state = printable(self._failed(f'segmentation refused: {_reason(error)}'))
-            self._events.reject(self.state)
+            self._line = printable(self._failed(f'segmentation refused: {_reason(error)}'))
+            self._events.reject(self._line)
             return
         count = sum(len(one.structures) for one in self._anatomies)
         waits = '' if self._target is not None else '; waits for a target'
@@ -205,7 +224,7 @@ class SlicerPlanner:
         return line + '; the needle shown is of an earlier plan' * self._shown
 
     def _report(self, line: str, severity: Severity = Severity.INFO) -> None:
-        self.state = printable(line)
+        self._line = printable(line)
         self._events.add(severity, line)
 
 

@@ -41,6 +41,7 @@ _CHECK: Final = 0.02
 _PERIOD: Final = 0.05
 
 _AT_ONCE: Final = 16  #: largest number of messages per reading
+_MOST_IGNORED: Final = 20  #: largest number of devices that are named because they are ignored
 
 _PACKAGE: Final = 'pyigtl'
 
@@ -92,6 +93,8 @@ class SlicerNode(BaseNode):
         self._told = '', ''
         self._shapes = self._targets = self._stamp = 0
         self._rate = RateCounter()
+        #: Why the last target was refused, and types and devices that were named.
+        self._refused, self._ignored = '', set[tuple[str, str]]()
         #: Unanswered target with its message.
         self._sending: tuple[PendingRequest, PointStamped] | None = None
 
@@ -127,7 +130,13 @@ class SlicerNode(BaseNode):
             read = messages.read_segmentation
             self._planner = SlicerPlanner(planning, read, self._events, self._planned)
             largest = messages.largest_of_plans
-        self._link = Connection(settings, largest, self._events)
+
+        def wanted(kind: str, device: str) -> int:
+            if not (size := largest(kind, device)):
+                self._ignore(kind, device)
+            return size
+
+        self._link = Connection(settings, wanted, self._events)
         self._target = self.publisher(contract.TARGET)
         self._tip_pose = self.publisher(contract.TIP_POSE)
         # Sensor drivers may publish their shapes with the QoS of sensors.
@@ -245,6 +254,7 @@ class SlicerNode(BaseNode):
             self._sending = None
             accepted, line = pending.outcome
             if not accepted:
+                self._refused = line
                 self._events.add(Severity.ERROR, line, 'answer')
         elif pending.repeat():
             self._target.publish(message)
@@ -255,9 +265,13 @@ class SlicerNode(BaseNode):
             try:
                 found = interpreter.target(frame)
             except MessageError as error:
-                self._events.reject(f'target refused: {error}')
+                self._refused = f'target refused: {error}'
+                self._events.reject(self._refused)
                 continue
-            newest = newest if found is None else (frame, found.tolist())
+            if found is None:
+                self._ignore(frame.kind, frame.device)
+            else:
+                newest, self._refused = (frame, found.tolist()), ''
         if len(frames) > 2:
             self._events.add(
                 Severity.WARNING,
@@ -288,17 +302,26 @@ class SlicerNode(BaseNode):
         # Of several segmentations and targets of the same moment, the newest are used.
         for frame in [one for one in frames if one.kind == 'IMAGE'][-1:]:
             planner.take_segmentation(frame)
-        newest = None
         for frame in [one for one in frames if one.kind != 'IMAGE'][-_AT_ONCE:]:
             try:
                 found = target_in_images(frame)
             except MessageError as error:
-                self._events.reject(f'target refused: {error}')
+                planner.refuse_target(str(error))
                 continue
-            newest = newest if found is None else found
-        if newest is not None:
-            planner.take_target(newest)
-            self._targets += 1
+            if found is None:
+                self._ignore(frame.kind, frame.device)
+            else:
+                planner.take_target(found)
+                self._targets += 1
+
+    def _ignore(self, kind: str, device: str) -> None:
+        """Log once for each type and device that it has no target and no label map."""
+        from needle_insertion.slicer.messages import ACCEPTED, TYPES
+
+        named = self._ignored
+        if kind in TYPES and (kind, device) not in named and len(named) < _MOST_IGNORED:
+            named.add((kind, device))
+            self._events.add(Severity.INFO, f'{kind} of {device!r} is ignored: {ACCEPTED}')
 
     def _send_plan_state(self, link: Connection, interpreter: Interpreter, state: str) -> None:
         from needle_insertion.slicer.messages import PLAN_STATE
@@ -362,8 +385,9 @@ class SlicerNode(BaseNode):
             last_rejection=self._events.last_rejection,
             planning=planning,
         )
-        severity = Severity.ERROR if link.error else Severity.INFO
-        message = f'{link.state}; shape: {shown}' + (planning and f'; {planning}')
+        refused = Severity.WARNING if self._refused else Severity.INFO
+        severity = Severity.ERROR if link.error else refused
+        message = '; '.join(filter(None, (link.state, f'shape: {shown}', self._refused, planning)))
         return Diagnosis(severity, message, status)
 
 

@@ -199,11 +199,12 @@ def test_large_images_are_split_independently_of_chunks(data: Any) -> None:
     text = pyigtl.StringMessage('1 2 3', device_name='TARGET').pack()
     stream = b''.join([text, image, other, image, text])
     cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
-    frames, found = Frames(largest_of_plans, pytest.fail), []
+    frames, found = Frames(largest_of_plans), []
     for a, b in zip([0, *cuts], [*cuts, len(stream)], strict=True):
         found += frames.take(stream[a:b])
     assert [bytes(one.data) for one in found] == [text, image, image, text]
-    assert not frames.incomplete
+    assert not frames.is_large
+    assert not frames.lost()
 
 
 def test_image_is_accepted_by_name_and_size() -> None:
@@ -211,11 +212,24 @@ def test_image_is_accepted_by_name_and_size() -> None:
     assert largest_target('IMAGE', SEGMENTATION) == largest_of_plans('IMAGE', 'CT') == 0
     for kind, device in product(['POINT', 'STRING', 'TRANSFORM', 'IMAGE'], ['TARGET', 'a']):
         assert largest_of_plans(kind, device) == largest_target(kind, device)
-    lines: list[str] = []
-    frames = Frames(largest_of_plans, lines.append)
+    frames = Frames(largest_of_plans)
     size = LARGEST_IMAGE + 1
-    assert frames.take(HEADER.pack(1, b'IMAGE', b'SEGMENTATION', 0, 0, size, 0)) == []
-    assert lines == [
-        f'segmentation refused: a IMAGE message of {size} bytes, {LARGEST_IMAGE} at most'
-    ]
-    assert not frames.incomplete
+    (frame,) = frames.take(HEADER.pack(1, b'IMAGE', b'SEGMENTATION', 0, 0, size, 0))
+    assert frame.error == f'a IMAGE message of {size} bytes, {LARGEST_IMAGE} at most'
+    with pytest.raises(SegmentationError, match=f'SEGMENTATION: {frame.error}'):
+        read_segmentation(frame)
+    assert not frames.is_large
+
+
+@pytest.mark.parametrize('part', [HEADER.size, 0.3, 0.999])
+@pytest.mark.parametrize('size', [5, 50])
+def test_image_without_its_end_is_refused(part: float, size: int) -> None:
+    """Also one that is not larger than a target."""
+    image = image_message(np.ones((size, size, size), np.uint8), np.eye(4))
+    end = int(part) if part > 1.0 else int(part * len(image))
+    frames = Frames(largest_of_plans)
+    assert frames.take(image[:end]) == []
+    (frame,) = frames.lost()
+    reason = f'SEGMENTATION: connection lost, {end} of {len(image)} bytes received'
+    with pytest.raises(SegmentationError, match=reason):
+        read_segmentation(frame)

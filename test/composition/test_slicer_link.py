@@ -102,9 +102,14 @@ def test_next_peer_is_accepted_after_disconnect(desk: Desk, stack: ExitStack, si
         one.close()
         desk.until(lambda: not desk.link.peer, 'the end')
     assert desk.said('is gone: it closed the connection')
+    assert [one.error for one in desk.frames] == (
+        [f'connection lost, {size} of {len(MESSAGE)} bytes received'] * 3 if size > 58 else []
+    )
+    desk.frames.clear()
     one = visitor(desk, stack)
     one.sendall(MESSAGE)
     desk.until(lambda: desk.frames, 'the message')
+    assert not desk.frames[0].error
 
 
 def test_next_peer_is_accepted_after_connection_reset(desk: Desk, stack: ExitStack) -> None:

@@ -143,6 +143,92 @@ def test_refused_segmentation_is_one_line(labels: Path, values: Any, reason: str
     assert table.finish().endswith('waits for the label map SEGMENTATION')
 
 
+def test_corrected_labels_are_read_for_the_next_segmentation(labels: Path) -> None:
+    """And labels that became invalid are refused with the segmentation, which is discarded."""
+    table = Table(settings_of(labels))
+    table.planner.take_target(TARGET)
+    invalid = LABELS.replace('role: entry', 'role: skin')
+    for text, reason in (
+        (LABELS.replace('2: {', '9: {'), 'labels without a role: SEGMENTATION:2'),
+        (LABELS, ''),
+        (invalid, f'{labels}: structures: 1.role must be one of'),
+        (LABELS, ''),
+    ):
+        labels.write_text(text)
+        table.planner.take_segmentation(segmentation())
+        state = table.finish()
+        assert state.startswith('segmentation refused: ' if reason else 'plan for the target')
+        assert reason in state
+        assert (table.planner.shape is None) == bool(reason)
+
+
+@pytest.mark.requirement('S-315')
+def test_segmentation_without_its_end_is_refused(labels: Path) -> None:
+    """As a damaged one: the anatomy before is another one."""
+    table = Table(settings_of(labels))
+    table.planner.take_segmentation(segmentation())
+    table.planner.take_target(TARGET)
+    assert table.finish().startswith('plan for the target')
+    table.planner.take_segmentation(Frame('IMAGE', SEGMENTATION, b'', 'connection lost'))
+    state = table.finish()
+    assert state.startswith('segmentation refused: SEGMENTATION: connection lost')
+    assert state.endswith('the needle shown is of an earlier plan')
+    table.planner.take_target(beside(1.0))
+    assert table.finish().endswith('waits for the label map SEGMENTATION')
+
+
+def test_refused_target_is_stated_until_one_is_accepted(labels: Path) -> None:
+    """At any stage; the target before is discarded, and its needle is of an earlier plan."""
+    table = Table(settings_of(labels))
+    refused = 'target refused: it is invalid'
+    table.planner.take_target(TARGET)
+    table.finish()
+    table.planner.refuse_target('it is invalid')
+    assert table.finish() == f'{refused}; waits for the label map SEGMENTATION and a target'
+    table.planner.take_segmentation(segmentation())
+    state = table.finish()
+    assert state == f'{refused}; segmentation with 3 structures; waits for a target'
+    table.planner.take_target(TARGET)
+    assert table.finish().startswith('plan for the target')
+    table.planner.refuse_target('it is invalid')
+    shown = '; the needle shown is of an earlier plan'
+    assert table.finish() == f'{refused}{shown}; waits for a target'
+    assert table.planner.shape is None
+    assert table.events.last_rejection == f'{refused}{shown}'
+    # No plan for the target before.
+    table.planner.take_segmentation(segmentation())
+    assert table.finish().startswith(refused)
+    table.planner.take_target(TARGET)
+    assert table.finish().startswith('plan for the target')
+    assert table.events.rejected == 2
+
+
+def test_target_that_is_refused_while_planning_ends_the_plan(labels: Path) -> None:
+    jobs: list[Any] = []
+
+    class Waiting(Job[Any]):
+        """A job that runs when the test says so."""
+
+        def _start(self) -> None:
+            jobs.append(self)
+
+        def run(self) -> None:
+            Job._start(self)
+
+    table = Table(settings_of(labels), start=Waiting)
+    table.planner.take_segmentation(segmentation())
+    table.planner.take_target(TARGET)
+    table.poll()
+    jobs[0].run()
+    table.poll()
+    table.planner.refuse_target('it is invalid')
+    jobs[1].run()
+    for _ in range(3):
+        table.poll()
+    assert table.planner.state == 'target refused: it is invalid; waits for a target'
+    assert table.planner.shape is None
+
+
 def test_refused_segmentation_names_the_needle_shown(labels: Path) -> None:
     """As a failed plan does; nothing is said of a needle that was never shown."""
     table = Table(settings_of(labels))

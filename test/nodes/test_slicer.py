@@ -87,7 +87,7 @@ class Visitor:
 
     def __init__(self, room: Room) -> None:
         self.found: dict[str, Frame] = {}
-        self._frames = Frames(self._largest, pytest.fail)
+        self._frames = Frames(self._largest)
         self.socket = socket.socket()
         place = '127.0.0.1', room.port
         room.until(lambda: not self.socket.connect_ex(place), 'a connection')
@@ -95,7 +95,7 @@ class Visitor:
 
     @staticmethod
     def _largest(_kind: str, device: str) -> int:
-        return LARGEST * device.startswith('NeedlePlan')
+        return LARGEST * device.startswith(('NeedlePlan', 'NeedleState'))
 
     def received(self) -> dict[str, Frame]:
         with suppress(BlockingIOError):
@@ -104,7 +104,8 @@ class Visitor:
         return self.found
 
     def has(self, devices: int) -> bool:
-        return len(self.received()) == devices
+        found = [one for one in self.received() if one != 'NeedleState']
+        return len(found) == devices
 
     def message(self, device: str) -> Any:
         """Return the last message of a device, read by pyigtl."""
@@ -113,11 +114,9 @@ class Visitor:
         found.unpack(MessageBase.parse_header(data[: HEADER.size]), data[HEADER.size :])
         return found
 
-    def said(self, words: str) -> bool:
-        """Return whether the last state of the planner has some words."""
-        return 'NeedlePlanState' in self.received() and (
-            words in self.message('NeedlePlanState').string
-        )
+    def said(self, words: str, device: str = 'NeedlePlanState') -> bool:
+        """Return whether the last state, such as of the planner, has some words."""
+        return device in self.received() and words in self.message(device).string
 
     def send(self, room: Room, data: bytes) -> None:
         sent = 0
@@ -321,14 +320,67 @@ def test_lost_and_damaged_segmentations_are_one_line(room: Room, planning: dict[
         peer.send(room, target_message(IN_IMAGE) + image[: len(image) // 2])
         room.until(lambda: peer.said('waits for the label map'), 'the target')
     room.until(lambda: node.diagnose().status.rejected, 'the rejection')
-    line, lost = node.diagnose().status.last_rejection, 'connection lost, IMAGE SEGMENTATION has'
-    assert re.fullmatch(rf'segmentation refused: {lost} \d+ of {len(image)} bytes', line)
+    line, lost = node.diagnose().status.last_rejection, 'SEGMENTATION: connection lost,'
+    assert re.fullmatch(rf'segmentation refused: {lost} \d+ of {len(image)} bytes received', line)
+    assert node.diagnose().status.planning == line
     with closing(Visitor(room)) as peer:
         peer.send(room, image[:-1] + b'\1')
         room.until(lambda: peer.said('segmentation refused: SEGMENTATION: the message is'), '')
         peer.send(room, image)
         room.until(lambda: peer.said('plan for the target'), 'the plan')
     assert not room.targets
+
+
+@pytest.mark.parametrize('plans', [False, True])
+def test_refused_target_is_sent_until_one_is_accepted(
+    plans: bool, room: Room, planning: dict[str, Any]
+) -> None:
+    """In the state of the nodes, and with labels in that of the planner."""
+    node = room.slicer(**(planning if plans else {}))
+    valid = REGISTRATION.to_image(TARGET).tolist()
+    far = pyigtl.TransformMessage(np.diag([2.0, 1.0, 1.0, 1.0]), device_name='TARGET').pack()
+    damaged = target_message(valid)[:-1] + b'\1'
+    with closing(Visitor(room)) as peer:
+        for data, reason in (
+            (target_message([float('nan'), 0.0, 0.0]), 'target refused: it must be three finite'),
+            (damaged, 'target refused: the message is damaged'),
+            (far, 'target refused: the matrix of a TRANSFORM must be a rotation'),
+        ):
+            peer.send(room, target_message(valid))
+            room.until(lambda: 'refused' not in node.diagnose().message, 'the target')
+            peer.send(room, data)
+            room.until(partial(peer.said, reason, 'NeedleState'), reason)
+            if plans:
+                room.until(partial(peer.said, reason), 'the state of the planner')
+        peer.send(room, target_message(valid))
+        room.until(lambda: not peer.said('refused', 'NeedleState'), 'the next target')
+
+
+def test_ignored_devices_are_named_once(room: Room, capfd: pytest.CaptureFixture[str]) -> None:
+    """With what is accepted, and no line for types that are no target."""
+    node = room.slicer()
+    ignored = [
+        pyigtl.PointMessage(np.zeros((1, 3)), names=['a'], device_name='Target'),
+        pyigtl.TransformMessage(np.eye(4), device_name='target'),
+        pyigtl.ImageMessage(np.zeros((2, 2, 2), dtype=np.uint8), device_name='SEGMENTATION'),
+        pyigtl.PolyDataMessage(
+            points=np.zeros((3, 3)), polygons=np.array([3, 0, 1, 2]), device_name='Liver'
+        ),
+    ]
+    data = b''.join(one.pack() for one in ignored)
+    with closing(Visitor(room)) as peer:
+        for _ in range(3):
+            peer.send(room, data)
+        peer.send(room, target_message(REGISTRATION.to_image(TARGET)))
+        room.until(lambda: room.targets, 'the target')
+    lines = [one for one in capfd.readouterr().err.splitlines() if ' is ignored: ' in one]
+    names = [
+        re.search(r"(\w+) of '(\w+)' is ignored: a target is a point named", one) for one in lines
+    ]
+    assert [one.groups() for one in names if one] == [
+        ('TRANSFORM', 'target'), ('IMAGE', 'SEGMENTATION'), ('POINT', 'Target')
+    ]  # fmt: skip
+    assert node.diagnose().status.targets == 1
 
 
 def test_predicted_tip_pose_is_sent(room: Room) -> None:
@@ -479,7 +531,7 @@ def test_slicer_ros2_can_subscribe(room: Room) -> None:
             {'registration.rotation': [0.0, 0.0, 0.0, 0.0]},
             'registration.rotation must be a quaternion x, y, z, w of norm 1',
         ),
-        ({'host': 'localhost'}, 'host must be an IPv4 address such as 127.0.0.1'),
+        ({'host': 'slicer'}, 'host must be an IPv4 address such as 127.0.0.1'),
         ({'role': 'both'}, 'role must be one of server, client'),
         ({'planning.labels': 'none.yaml'}, 'none.yaml cannot be read: No such file or directory'),
         ({'planning.turns': 1}, 'turns must be 0'),
