@@ -40,6 +40,7 @@ _PARTS: Final = 16  #: Parts of a line with a largest bow each.
 _LENGTHS: Final = 0.02  #: Distance of the lengths for which the largest bow is computed [m].
 _MORE: Final = 1.1  #: Factor of the largest bow, for the lengths and places between.
 _OFF: Final = 1e-4  #: Largest distance of the tip from the target in the simulation [m].
+_FAR: Final = 1.0  #: Largest plausible coordinate of a target [m].
 _FINEST: Final = 1e-4  #: Least resolution [m].
 #: Part of the resolution for the search; the rest is for the check of the plan.
 _SEARCHED: Final = 0.9
@@ -417,7 +418,7 @@ def _check_inside(anatomies: Sequence[Anatomy], target: FloatArray) -> None:
     at = ', '.join(f'{1e3 * one:.2f}' for one in target)
     corners = '; '.join(map(_corners, anatomies))
     hint = ''
-    if any(_contains(one, 1e-3 * target) for one in anatomies):
+    if np.abs(target).max() > _FAR and any(_contains(one, 1e-3 * target) for one in anatomies):
         hint = f'; numbers without a unit are m: {",".join(f"{one:g}mm" for one in target)}'
     raise ParameterError(
         f'the target {at} mm is outside the image, whose corners are within {corners} mm{hint}'

@@ -163,3 +163,7 @@ def test_target_in_m_that_would_be_inside_in_mm_has_a_hint() -> None:
     with pytest.raises(ParameterError, match='is outside the image') as error:
         find_plan(body(), 1e4 * TARGET)
     assert 'unit' not in str(error.value)
+    # It is in m, although 0.4 mm would be inside.
+    with pytest.raises(ParameterError, match='is outside the image') as error:
+        find_plan(body(), (0.4, 0.03, 0.02))
+    assert 'unit' not in str(error.value)
