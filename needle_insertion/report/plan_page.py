@@ -28,7 +28,7 @@ from needle_insertion.report.section import (
 )
 from needle_planning.anatomy import Anatomy, plan_warnings, ROLES
 from needle_planning.chance import Chance
-from needle_planning.clearance import Clearance
+from needle_planning.clearance import Clearance, LIMIT
 from needle_planning.planned_needle import complete_needle, shafts
 from needle_ros.errors import ParameterError
 import numpy as np
@@ -163,14 +163,21 @@ def _values(plan: Plan) -> list[tuple[str, str, str]]:
         ('largest bow', plan.bow, 'deflection of the shaft from the straight line'),
         ('clearance', plan.clearance, f'least one, {plan.structure or "beyond 30 mm"}'),
         ('resolution', plan.resolution, 'of the search'),
-        ('bound straight', plan.straight_bound, 'no straight needle has more'),
-        ('bound', plan.bound, 'no needle within the limits of the guide has more'),
+        ('bound straight', plan.straight_bound, _bound('straight needle', plan.straight_bound)),
+        ('bound', plan.bound, _bound('needle within the limits of the guide', plan.bound)),
     )
     return [
         ('needle', plan.needle, 'name or file'),
         ('roll', f'{np.degrees(plan.roll):.2f} deg', 'rotation about its axis'),
         *((name, f'{_mm(value)} mm', meaning) for name, value, meaning in lengths),
     ]
+
+
+def _bound(kind: str, bound: float) -> str:
+    # Clearances above the limit are not distinguished.
+    return (
+        f'limit of the search, a {kind} may have more' if bound >= LIMIT else f'no {kind} has more'
+    )
 
 
 def _steps(plan: Plan, shaft: _Shaft) -> list[tuple[str, ...]]:

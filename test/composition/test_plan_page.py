@@ -370,6 +370,22 @@ def test_command_writes_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert all(one in seen for one in entry)
 
 
+def test_clearance_at_the_limit_has_no_bound(
+    straight: Plan, anatomy: Anatomy, tmp_path: Path
+) -> None:
+    """Larger clearances are not searched."""
+    far = replace(
+        anatomy, structures={**anatomy.structures, 2: Structure(name='muscle 2', role='tissue')}
+    )
+    plan = find_plan(far, straight.target, bow=False)
+    for one, image, at_limit in ((plan, far, True), (straight, anatomy, False)):
+        plan_page.write_plan_page(one, image, tmp_path / 'plan.html')
+        seen = look_at(tmp_path / 'plan.html').text
+        assert ('at least 30.00 mm' in seen) == at_limit
+        assert ('limit of the search, a straight needle may have more' in seen) == at_limit
+        assert ('no straight needle has more' in seen) != at_limit
+
+
 def test_pages_of_a_folder_have_their_own_pictures(
     straight: Plan, anatomy: Anatomy, tmp_path: Path
 ) -> None:
