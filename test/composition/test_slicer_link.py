@@ -12,8 +12,11 @@ from time import monotonic, sleep
 from typing import Any
 
 from benchmarks.igtl_peer import free_port
-from needle_insertion.slicer.link import Connection, HEADER, LinkSettings
+from hypothesis import given
+from hypothesis import strategies as st
+from needle_insertion.slicer.link import Connection, Frames, HEADER, LinkSettings
 from needle_insertion.slicer.messages import largest_target, TARGET
+from needle_ros.errors import MessageError, ParameterError
 from needle_ros.event_log import EventLog
 import numpy as np
 import pyigtl
@@ -255,3 +258,38 @@ def test_closed_link_can_be_reopened(desk: Desk, stack: ExitStack) -> None:
         socket.create_connection(('127.0.0.1', desk.port))
     desk.poll()
     visitor(desk, stack)
+
+
+@pytest.mark.parametrize(
+    ('given_', 'complaint'),
+    [
+        ({'role': 'peer'}, 'role must be one of server, client'),
+        ({'host': 'slicer'}, "host must be an IPv4 address such as 127.0.0.1, got 'slicer'"),
+        ({'port': 0}, 'port must be finite, >= 1'),
+        ({'port': 80.5}, 'port must be a whole number'),
+    ],
+)
+def test_invalid_link_settings_are_rejected(given_: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ParameterError, match=complaint):
+        LinkSettings(**given_)
+
+
+def test_localhost_is_this_machine() -> None:
+    """It needs no look-up of a name, which can block."""
+    assert LinkSettings(host='localhost') == LinkSettings(host='127.0.0.1')
+
+
+@given(
+    st.integers(0, 5) | st.integers(0, 65535),
+    st.binary(min_size=12, max_size=12) | st.sampled_from([b'POINT' + bytes(7), b'STATUS' * 2]),
+)
+def test_message_type_names_are_printable(version: int, kind: bytes) -> None:
+    """A header of another protocol is rejected."""
+    header = struct.pack('>H12s', version, kind) + bytes(HEADER.size - 14)
+    name = kind.rstrip(b' \0')
+    if version in (1, 2, 3) and name.isascii() and name.decode('latin1').isprintable():
+        found = Frames(largest_target).take(header)
+        assert [one.kind for one in found] == ['POINT'] * (name == b'POINT')
+    else:
+        with pytest.raises(MessageError):
+            Frames(largest_target).take(header)
