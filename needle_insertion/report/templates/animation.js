@@ -12,7 +12,7 @@
   box.hidden = false;
   const drawing = new needleDrawing.Drawing(box.querySelector('canvas'));
   /* Reserve the range of all frames from the start. */
-  frames.forEach((frame) => drawing.room({...frame, path}, scene));
+  frames.forEach((frame) => drawing.reserve({...frame, path}, scene));
 
   function draw() {
     const frame = frames.reduce((found, one) => (one.time <= time ? one : found));

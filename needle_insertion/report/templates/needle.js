@@ -19,6 +19,8 @@ const needleDrawing = (() => {
 
   /* Shown length outside, smallest width, and margin below the deepest point [mm]. */
   const OUTSIDE = 45, LEAST = 10, BEYOND = 12;
+  /* Largest coordinate that is drawn [mm], and time for which a range is kept [ms]. */
+  const FARTHEST = 1000, HOLD = 10000;
   const MARGIN = {left: 44, right: 10, top: 6, between: 12, bottom: 34};
 
   const mm = (value) => 1e3 * value;
@@ -78,24 +80,70 @@ const needleDrawing = (() => {
     }
   }
 
+  const far = (value) => Number.isFinite(value) && Math.abs(mm(value)) > FARTHEST;
+
+  /* Return a frame without the coordinates that are too far to be drawn, and their words. */
+  function plausible(frame) {
+    const shown = {...frame}, left = [], {depth, tip, target, expected} = frame;
+    const check = (key, words, values, none = null) => {
+      const value = values.find(far);
+      if (value === undefined) return;
+      shown[key] = none;
+      if (words) left.push(`${words} ${mm(value).toPrecision(3)} mm`);
+    };
+    check('depth', 'depth', [depth]);
+    /* The depth of the tip is not drawn. */
+    if (tip) check('tip', 'tip', [tip[0], tip[2]]);
+    if (target) check('target', 'target', target);
+    if (expected) check('expected', 'predicted tip', [...expected.at, ...expected.half]);
+    /* A straight needle is drawn from depth and tip. */
+    check('needle', left.length ? '' : 'needle', (frame.needle || []).flat());
+    check('path', 'cut path', (frame.path || []).flat());
+    check('other', 'other needle', (frame.other || []).flat());
+    return {shown, left};
+  }
+
+  /* The larger of two ranges: end of the depth and half of the width [mm]. */
+  const larger = (one, other) => one.map((value, k) => Math.max(value, other[k]));
+
   class Drawing {
     constructor(canvas) {
       this.canvas = canvas;
-      /* Limits only grow, so that the picture does not jump. */
       this.lateral = 1;  /* lateral scale over the scale of the depth */
       this.plan = null;  /* path of the tip and free space around it */
       this.reset();
     }
 
-    /* Reset the limits for another recording or time. */
+    /* Reset the range for another recording or time. */
     reset() {
-      this.end = 60;
       /* Magnified, the needle needs no margin for a later motion. */
-      this.side = this.lateral > 1 ? 2 : LEAST;
+      this.least = [60, this.lateral > 1 ? 2 : LEAST];
+      this.earlier = this.latest = this.least;
+      [this.end, this.side] = this.least;
+      this.since = performance.now();
+      this.shown = null;  /* the newest frame, as drawn */
+      this.left = [];  /* words about its coordinates that are not drawn */
     }
 
-    /* Extend the limits for later drawings. */
+    /* Extend the smallest range for later drawings. */
+    reserve(frame, scene) {
+      this.least = larger(this.least, this.needs(plausible(frame).shown, scene));
+    }
+
+    /* Set the range: that of the last 10 to 20 s, without small changes. */
     room(frame, scene) {
+      const now = performance.now();
+      if (now - this.since > HOLD) {
+        [this.earlier, this.latest, this.since] = [this.latest, this.least, now];
+      }
+      this.latest = larger(larger(this.latest, this.least), this.needs(frame, scene));
+      const [end, side] = larger(this.earlier, this.latest);
+      if (end > this.end || end < 0.75 * this.end) this.end = end;
+      if (side > this.side || side < 0.75 * this.side) this.side = side;
+    }
+
+    /* Return the range that a frame needs. */
+    needs(frame, scene) {
       const depths = [0], sides = [0];
       const line = (points) => {
         if (!points || !points.length) return;
@@ -107,7 +155,7 @@ const needleDrawing = (() => {
       line(frame.needle);
       line(frame.path);
       line(frame.other);
-      line(this.plan && this.plan.path);
+      line(this.plan && plausible({path: this.plan.path}).shown.path);
       for (const at of [frame.target, frame.expected && frame.expected.at]) {
         if (!at) continue;
         if (at[1] !== null) depths.push(mm(at[1]));
@@ -116,11 +164,13 @@ const needleDrawing = (() => {
       const deepest = Math.max(...depths, mm(frame.depth || 0)) + BEYOND;
       const layers = scene.tissue ? scene.tissue.layers : [];
       const last = layers.length > 1 ? mm(layers[layers.length - 1][0]) + 15 : 0;
-      this.end = Math.max(this.end, 10 * Math.ceil(Math.max(deepest, last) / 10));
-      this.side = Math.max(this.side, Math.ceil(Math.max(...sides) + (this.lateral > 1 ? 1 : 3)));
+      return [10 * Math.ceil(Math.min(FARTHEST, Math.max(deepest, last)) / 10),
+        Math.ceil(Math.max(...sides) + (this.lateral > 1 ? 1 : 3))];
     }
 
-    draw(scene, frame) {
+    draw(scene, given) {
+      const {shown: frame, left} = plausible(given);
+      [this.shown, this.left] = [frame, left];
       this.room(frame, scene);
       const width = this.canvas.clientWidth || 600;
       const scale = (width - MARGIN.left - MARGIN.right) / (this.end + OUTSIDE);
@@ -148,7 +198,7 @@ const needleDrawing = (() => {
       pen.clip();
       this.tissue(pen, plane, scene, right);
       /* A grid with steps wide enough for the labels. */
-      const step = [1, 2, 5].find((one) => aside * one > 14) || 10;
+      const step = [1, 2, 5, 10, 20, 50, 100, 200, 500].find((one) => aside * one > 14) || 1000;
       pen.strokeStyle = COLORS.grid;
       pen.lineWidth = 1;
       stroke(pen, COLORS.grid, 1, [], [[left, middle], [right, middle]]);
@@ -180,7 +230,7 @@ const needleDrawing = (() => {
       pen.restore();
       if (!last) return;
       pen.textAlign = 'center';
-      const gap = scale * 10 > 34 ? 10 : 20;
+      const gap = scale * 10 > 34 ? 10 : [20, 50, 100, 200, 500].find((one) => scale * one > 26) || 1000;
       for (let value = -gap * Math.floor(OUTSIDE / gap); value <= this.end; value += gap) {
         const x = across(value / 1e3);
         stroke(pen, COLORS.faint, 1, [], [[x, bottom], [x, bottom + 3]]);
@@ -315,5 +365,5 @@ const needleDrawing = (() => {
     if (tip) ring(pen, x(from(tip)[0]), y(from(tip)[1]), 5);
   }
 
-  return {Drawing, aim, prepared, stroke, label, cross, COLORS};
+  return {Drawing, aim, prepared, stroke, label, cross, COLORS, FARTHEST};
 })();

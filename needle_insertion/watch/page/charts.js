@@ -6,7 +6,7 @@
  * table. Times are in s, values in SI units. A value of null, or a pause, is a gap.
  */
 const needleCharts = (() => {
-  const {prepared, stroke, label, COLORS} = needleDrawing;
+  const {prepared, stroke, label, COLORS, FARTHEST} = needleDrawing;
   const SOLID = [COLORS.needle, []], DASHED = [COLORS.target, [6, 4]];
   /* Lines of another recording, for each of the above. */
   const OTHER = new Map([[COLORS.needle, [COLORS.tip, [2, 4]]], [COLORS.target, [COLORS.expected, [9, 4, 2, 4]]]]);
@@ -33,7 +33,11 @@ const needleCharts = (() => {
   const ROW = ['depth', 'reference', 'velocity', 'error', 'force', 'force_x', 'force_z', 'tip_x', 'tip_z', 'guide_x', 'guide_z', 'roll'];
 
   const fixed = (value, digits) =>
-    (value === null || value === undefined ? '–' : (value + 0).toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
+    (value === null || value === undefined ? '–' : Math.abs(value) >= 1e7 ? value.toExponential(2)
+      : (value + 0).toFixed(digits).replace(/^-(0\.?0*)$/, '$1'));
+
+  /* Whether a value of a chart is drawn: lengths up to the largest that the needle is drawn with. */
+  const drawn = ({si, factor}, value) => value !== null && (si !== 'm' || Math.abs(value * factor) <= FARTHEST);
 
   /* Number of times up to a time, in ascending times. */
   function upTo(times, time) {
@@ -49,8 +53,9 @@ const needleCharts = (() => {
   function steps(low, high, number) {
     const rough = (high - low) / number, power = 10 ** Math.floor(Math.log10(rough));
     const step = [1, 2, 5, 10].find((one) => one * power >= rough) * power;
-    const values = [];
-    for (let k = Math.ceil(low / step - 1e-9); k * step <= high; k += 1) values.push(k * step);
+    const values = [], first = Math.ceil(low / step - 1e-9);
+    /* Of numbers without finite differences there are no ticks. */
+    for (let k = 0; k <= 2 * number && (first + k) * step <= high; k += 1) values.push((first + k) * step);
     return {values, digits: Math.max(0, -Math.floor(Math.log10(step) + 1e-9))};
   }
 
@@ -105,6 +110,10 @@ const needleCharts = (() => {
         choices.append(choice);
         chart.chosen[name] = tick;
       }
+      /* Words about values that are not drawn. */
+      chart.far = document.createElement('span');
+      chart.far.className = 'far';
+      caption.append(chart.far);
       figure.append(caption, chart.canvas);
       this.box.append(figure);
       this.listen(chart.canvas);
@@ -269,7 +278,7 @@ const needleCharts = (() => {
     }
 
     /* Points of a signal in a time range, without those of the same pixel between extremes. */
-    lines([times, values], from, to, x, y) {
+    lines(chart, [times, values], from, to, x, y) {
       const found = [];
       let points = [], column = NaN, low = null, high = null;
       const end = () => {
@@ -279,13 +288,13 @@ const needleCharts = (() => {
       const last = Math.min(times.length, upTo(times, to) + 1);
       for (let k = Math.max(0, upTo(times, from) - 1); k < last; k += 1) {
         const value = values[k];
-        if (value === null) {
+        if (!drawn(chart, value)) {
           end();
           found.push(points);
           [points, column] = [[], NaN];
           continue;
         }
-        const at = [x(times[k]), y(value)], pixel = Math.floor(at[0]);
+        const at = [x(times[k]), y(value * chart.factor)], pixel = Math.floor(at[0]);
         if (pixel !== column) end();
         column = pixel;
         if (low === null || at[1] < low[1]) low = at;
@@ -295,22 +304,31 @@ const needleCharts = (() => {
       return [...found, points].filter((one) => one.length);
     }
 
-    extent(series, from, to) {
-      let low = Infinity, high = -Infinity;
+    /* Smallest and largest value in a time range, null without values, and number not drawn. */
+    extent(chart, series, from, to) {
+      let low = Infinity, high = -Infinity, count = 0;
       for (const {data: [times, values]} of series) {
         for (let k = Math.max(0, upTo(times, from) - 1), last = upTo(times, to); k < last; k += 1) {
           if (values[k] === null) continue;
+          if (!drawn(chart, values[k])) {
+            count += 1;
+            continue;
+          }
           low = Math.min(low, values[k]);
           high = Math.max(high, values[k]);
         }
       }
-      return low > high ? null : [low, high];
+      return {ends: low > high ? null : [low, high], count};
     }
 
-    one({canvas, factor, least, limit}, series, limits) {
+    one(chart, series, limits) {
+      const {canvas, factor, least, limit, far} = chart;
       const width = canvas.clientWidth || 300, pen = prepared(canvas, width, HEIGHT);
       const right = width - RIGHT, bottom = HEIGHT - BOTTOM, [from, to] = this.range();
-      let [low, high] = (this.extent(series, from, to) || [-least / factor, least / factor]).map((one) => one * factor);
+      const {ends, count} = this.extent(chart, series, from, to);
+      let [low, high] = (ends || [-least / factor, least / factor]).map((one) => one * factor);
+      far.hidden = !count;
+      far.textContent = `${count} values beyond ${FARTHEST} mm are not drawn`;
       const pad = Math.max(0.08 * (high - low), (least - (high - low)) / 2);
       [low, high] = [low - pad, high + pad];
       const x = (time) => LEFT + (time - from) * (right - LEFT) / (to - from);
@@ -343,7 +361,7 @@ const needleCharts = (() => {
       pen.rect(LEFT, 0, right - LEFT, HEIGHT);
       pen.clip();
       for (const {line: [color, dash], data} of series) {
-        for (const points of this.lines(data, from, to, x, (value) => y(value * factor))) {
+        for (const points of this.lines(chart, data, from, to, x, y)) {
           /* A sample between two gaps is a point. */
           if (points.length === 1) points.push([points[0][0] + 1, points[0][1]]);
           stroke(pen, color, 1.8, dash, points);

@@ -199,7 +199,7 @@ function tellAim() {
   const target = frame.target && frame.target[0] !== null ? frame.target : null;
   find('aimed').hidden = target === null;
   if (!target) return;
-  needleDrawing.aim(find('aim'), frame);
+  needleDrawing.aim(find('aim'), {...frame, ...drawing.shown, target: frame.target});
   const parts = [`Target x ${fixed(mm(target[0]), 2)}, y ${fixed(mm(target[1]), 1)}, z ${fixed(mm(target[2]), 2)} mm.`];
   if (frame.expected) {
     const {at, half} = frame.expected;
@@ -218,6 +218,9 @@ function tellShape() {
     : frame.shape === null ? 'Needle position unknown: no joint_states received.' : '';
   find('shape').hidden = words === '';
   put(find('shape'), words);
+  const far = drawing.left.join(', ');
+  find('far').hidden = far === '';
+  put(find('far'), `Not drawn, beyond ${needleDrawing.FARTHEST} mm: ${far}.`);
 }
 
 function tellCursor() {
@@ -238,7 +241,7 @@ function say() {
   tellShape();
   tellCursor();
   charts.draw(frame.time, scene.limits);
-  if (anatomy) anatomy.show(frame.needle);
+  if (anatomy) anatomy.show(drawing.shown && drawing.shown.needle);
   if (playback) tellPlayback();
 }
 
