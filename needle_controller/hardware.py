@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Adapter for robot drivers with their own topics, joints and units."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from math import isfinite, isnan, nan
-from typing import Final
+from typing import Any, Final
 
 from needle_controller.admittance import Admittance
 from needle_controller.controller import Controller, Measurement
@@ -14,7 +14,15 @@ from needle_dynamics import NeedleParameters
 from needle_ros.contract import BASE_WRENCH, INSERTION, ROTATION
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import AXES, signed_axis
-from needle_ros.settings import check_constants, choice, constant, flag, positive, text
+from needle_ros.settings import (
+    check_constants,
+    choice,
+    constant,
+    flag,
+    from_values,
+    positive,
+    text,
+)
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 
@@ -139,6 +147,14 @@ class HardwareSettings:
         return (3 - along - aside, third), (along, sign), (aside, other)
 
 
+def settings_in(parameters: Mapping[str, Any], **own: Any) -> HardwareSettings:
+    """Return the settings in the parameters of a controller; `own` replaces values by name."""
+    prefix = 'hardware.'
+    names = [item.name for item in fields(HardwareSettings) if prefix + item.name in parameters]
+    values = {name: parameters[prefix + name] for name in names}
+    return from_values(HardwareSettings, values | own, prefix)
+
+
 def dynamic_reading(
     stamp: int,
     frame: str,
@@ -217,6 +233,10 @@ class Robot:
         """Return the insertion depth [m] at a position of the joint, in its unit."""
         return self._gain * (position - self.settings.zero)
 
+    def velocity(self, speed: float) -> float:
+        """Return the velocity of insertion [m/s] for a speed of the joint, in its unit."""
+        return self._gain * speed
+
     def force(self, effort: float) -> float:
         """Return the axial force on the needle [N] for an effort of the joint, in its unit."""
         return effort / self._gain
@@ -230,7 +250,7 @@ class Robot:
         """
         settings = self.settings
         position, speed, effort = self._find(settings.joint, reading)
-        depth, velocity = self.length(position), self._gain * speed
+        depth, velocity = self.length(position), self.velocity(speed)
         time = reading.stamp / NANOSECONDS
         angle = angular_velocity = 0.0
         force = nan

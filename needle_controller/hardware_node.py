@@ -30,7 +30,7 @@ _DISCOVERY: Final = 10.0  #: Longest time to find a topic by its type [s].
 _PAUSE: Final = 0.1  #: Time between two checks for the topic [s].
 
 
-def _named(topic: Topic, name: str, type_name: str) -> Topic:
+def named(topic: Topic, name: str, type_name: str) -> Topic:
     """Return a topic of the contract under the driver's name and type."""
     if name:
         try:
@@ -107,7 +107,7 @@ class Driver:
         self._node, self._settings = node, settings
         state, wrench = (self._found(*reading) for reading in _readings(settings))
         kind = hardware.COMMAND_TYPES[settings.command_type]
-        command = _named(contract.WRENCH_COMMAND, settings.command_topic, kind)
+        command = named(contract.WRENCH_COMMAND, settings.command_topic, kind)
         self.topics = Topics(
             state, wrench, command, _of(contract.MEASURER, state), _of(contract.COMMANDER, command)
         )
@@ -126,14 +126,14 @@ class Driver:
     def _found(self, topic: Topic, name: str, type_name: str) -> Topic:
         """Return the driver's topic; `BY_TYPE` selects the only topic of its type."""
         if name != hardware.BY_TYPE:
-            return _named(topic, name, type_name)
+            return named(topic, name, type_name)
         found = _published(self._node, type_name)
         if len(found) != 1:
             raise ParameterError(
                 f'hardware: {hardware.BY_TYPE} for {topic.name} needs one topic of {type_name} '
                 f'that other nodes publish, found {", ".join(found) or "none"}'
             )
-        return _named(topic, found[0], type_name)
+        return named(topic, found[0], type_name)
 
     # From the robot.
 

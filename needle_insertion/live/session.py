@@ -2,7 +2,6 @@
 """Start nodes for a person or a script, and end them with the session."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 import os
 from pathlib import Path
 import signal
@@ -10,7 +9,7 @@ import sys
 from time import monotonic
 from typing import Any, Final
 
-from needle_controller.hardware import BY_TYPE, HardwareSettings, Robot
+from needle_controller.hardware import BY_TYPE, Robot, settings_in
 from needle_insertion.graph.lockstep import activate_plant, start_nodes, WARM_UP, Witness
 from needle_insertion.graph.ros_graph import Graph, GraphError, NodeProcess
 from needle_insertion.live.operator import Operator
@@ -23,7 +22,6 @@ from needle_ros.base_node import LATCHED
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.network import DOMAIN
 from needle_ros.parameter_file import parameters_in
-from needle_ros.settings import from_values
 from needle_ros.wire import JOINT_STATE, WRENCH
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -183,15 +181,14 @@ def _robot(graph: Graph, node: Node) -> Robot | None:
     topic = contract.CONFIGURATION.name.replace('~', 'controller')
     latest = graph.latest(node, String, topic, LATCHED)
     graph.spin_until(lambda: latest.message, topic, _START)
-    values, prefix = parameters_in(latest.message.data), 'hardware.'
-    own = {item.name: values[f'{prefix}{item.name}'] for item in fields(HardwareSettings)}
+    values, own = parameters_in(latest.message.data), {}
     # The controller has found the topics of their type.
     for name, field in ((JOINT_STATE, 'state_topic'), (WRENCH, 'wrench_topic')):
-        if own[field] == BY_TYPE:
+        if values.get(f'hardware.{field}') == BY_TYPE:
             read = node.get_subscriber_names_and_types_by_node('controller', node.get_namespace())
             found = [topic for topic, types in read if name in types]
             own[field] = found[0] if len(found) == 1 else ''
-    return Robot(from_values(HardwareSettings, own, prefix))
+    return Robot(settings_in(values, **own))
 
 
 def _converse(terminal: Terminal, screen: Screen, witness: Witness | None) -> None:

@@ -2,8 +2,9 @@
 """Frames of a bag at any time."""
 
 from bisect import bisect_right
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from math import ceil, isnan, log2, nan
@@ -18,6 +19,7 @@ from needle_identification.bags.topics import BagTopic
 from needle_identification.recordings import TIMES
 from needle_identification.recordings.samples import are_gaps
 from needle_insertion.report.content import short_names
+from needle_insertion.watch.robot import WatchedRobot
 from needle_insertion.watch.view import CONFIGURED, EFFORT, RATE, Signal, signal_of, SIGNALS, View
 from needle_ros import contract
 from needle_ros.errors import MessageError, ParameterError
@@ -25,7 +27,7 @@ from needle_ros.parameter_file import parameters_in
 from needle_ros.settings import is_number
 from needle_ros.status import read_reports
 from needle_ros.timing import NANOSECONDS
-from needle_ros.wire import MessageReader, read_line, read_string
+from needle_ros.wire import MessageReader, read_line, read_string, Reading
 import numpy as np
 
 #: Topics shown on the page; each also in a namespace.
@@ -148,7 +150,8 @@ class ShownRecording:
 
         bag = Bag(path)
         topics = bag.topics()
-        chosen = _chosen(topics)
+        self._robot = _robot_of(bag, topics)
+        chosen, others = _chosen(topics, self._robot)
         if not chosen:
             known = ', '.join(topic.name for topic in (*STREAMS, *_OTHERS))
             raise RecordingError(
@@ -157,6 +160,9 @@ class ShownRecording:
             )
         self._first: int | None = None
         self._newest = 0.0
+        #: Newest time of each topic [s], and number of lost messages by words.
+        self._latest: dict[str, float] = {}
+        self._dropped = Counter[str]()
         begin = end = 0
         for message in bag.messages(chosen.__contains__):
             begin, end = begin or message.received, message.received
@@ -165,9 +171,12 @@ class ShownRecording:
             except (MessageError, RecordingError):
                 self._invalid += 1
         self.duration = self._newest
-        self.losses = tuple(bag.losses)
+        self.losses = (*bag.losses, *others)
+        if self._robot.words:
+            self.losses += (self._robot.words,)
         if self._invalid:
             self.losses += (f'{self._invalid} messages do not match the type of their topic',)
+        self.losses += tuple(f'{n} messages of {words}' for words, n in self._dropped.items())
         elapsed = (end - begin) / NANOSECONDS
         if self._header and self.duration > 2.0 * elapsed + _SLACK:
             contradiction = (
@@ -196,9 +205,7 @@ class ShownRecording:
             reading = self._readers[name].read(data)
             if self._header and reading.stamp:
                 time = self._time(reading.stamp)
-            self._keep((name, ''), time, lambda view: view.reading(name, reading, time))
-            for signal in _OF_TOPIC[name]:
-                self._curves[signal].add(time, signal.of(reading))
+            self._keep_reading(name, reading, time)
         elif name == contract.NEEDLE_SHAPE.name:
             which, points = read_line(data)
             if which in ('needle', 'path'):
@@ -215,6 +222,29 @@ class ShownRecording:
             parameters = parameters_in(read_string(data))
             self._keep((name, ''), time, lambda view: view.configuration(name, parameters))
 
+    def _keep_reading(self, name: str, reading: Reading, time: float) -> None:
+        # Of two publishers, the messages with the insertion joint stay.
+        which = ''
+        try:
+            converted = self._robot.reading(name, reading)
+        except ParameterError as error:
+            which = 'unusable'
+            self._drop(f'{name} are without a depth: {error}')
+        else:
+            latest = self._latest.get(name, time)
+            if time < latest:
+                self._drop(
+                    f'{name} are not shown: a stamp before has a later time (--time receive shows '
+                    'them)'
+                )
+            self._latest[name] = max(time, latest)
+            for signal in _OF_TOPIC[name]:
+                self._curves[signal].add(time, signal.of(converted))
+        self._keep((name, which), time, lambda view: view.reading(name, reading, time))
+
+    def _drop(self, words: str) -> None:
+        self._dropped[words] += 1
+
     def _keep(
         self, key: tuple[str, str], time: float, effect: _Effect, interval: float = 0.0
     ) -> None:
@@ -222,7 +252,7 @@ class ShownRecording:
 
     def view(self, time: float) -> View:
         """Return the state of the page at a time from the start [s]."""
-        view = View(self._silent)
+        view = View(self._silent, self._robot)
         view.invalid = self._invalid
         for kept in self._kept.values():
             kept.show(view, time)
@@ -332,16 +362,38 @@ class PagePlayback:
         self._since = self._steady()
 
 
-def _chosen(topics: tuple[BagTopic, ...]) -> dict[BagTopic, str]:
-    """Return the topics to read, by contract name or, for configurations, by node name."""
-    chosen: dict[str, BagTopic] = {}
-    # The last topic of a name, which is the shortest, replaces the others.
-    for topic in sorted(topics, key=lambda one: len(one.name), reverse=True):
-        space, _, last = topic.name.rpartition('/')
+def _chosen(
+    topics: tuple[BagTopic, ...], robot: WatchedRobot
+) -> tuple[dict[BagTopic, str], list[str]]:
+    """
+    Return the topics to read, by contract name or, for configurations, by node name.
+
+    Of several topics it is the one with the shortest name; the words report the others.
+    """
+    found = defaultdict[str, list[BagTopic]](list)
+    for topic in sorted(topics, key=lambda one: len(one.name)):
+        full = '/' + topic.name.strip('/')
         for known in (*STREAMS, *_OTHERS):
-            if topic.type_name == known.type_name and last == known.name.rpartition('/')[2]:
-                chosen[known.name] = topic
-        node = space.rpartition('/')[2]
-        if last == 'configuration' and node in CONFIGURED:
-            chosen[node] = topic
-    return {topic: name for name, topic in chosen.items()}
+            own = '/' + robot.topic(known.name).strip('/')
+            if topic.type_name == known.type_name and full.endswith(own):
+                found[known.name].append(topic)
+        for node in CONFIGURED:
+            if full.endswith(f'/{node}/configuration'):
+                found[node].append(topic)
+    words = [
+        f'{", ".join(other.name for other in others)}: not shown, only {one.name}'
+        for one, *others in found.values()
+        if others
+    ]
+    return {one: name for name, (one, *_) in found.items()}, words
+
+
+def _robot_of(bag: Bag, topics: tuple[BagTopic, ...]) -> WatchedRobot:
+    """Return the robot of the first configuration of the controller."""
+    robot = WatchedRobot()
+    own = [topic for topic, name in _chosen(topics, robot)[0].items() if name == 'controller']
+    for message in bag.messages(own.__contains__) if own else ():
+        with suppress(MessageError, RecordingError):
+            robot.configure(parameters_in(read_string(message.data)))
+        break
+    return robot

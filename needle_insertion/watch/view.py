@@ -2,15 +2,18 @@
 """State of the page: messages of all topics, needle, tissue and limits, as frames."""
 
 from collections.abc import Callable, Container, Mapping, Sequence
-from math import isfinite, sqrt
+from math import isfinite, isnan, sqrt
 from typing import Any, Final, NamedTuple
 
 from needle_controller.steering.insertion_plan import Plan
 from needle_dynamics import FloatArray
+from needle_insertion.watch.robot import WatchedRobot
 from needle_ros import contract
+from needle_ros.errors import ParameterError
 from needle_ros.quantities import NORMAL
 from needle_ros.settings import is_number
 from needle_ros.status import ControllerStatus, NodeReport, SteeringStatus
+from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
 import numpy as np
 
@@ -107,21 +110,32 @@ class Signal(NamedTuple):
     """Signal of the charts: its topic, and its value in a reading of the topic, in SI units."""
 
     topic: str
-    of: Callable[[Reading], float | None]
+    raw: Callable[[Reading], float | None]  #: None if the reading does not have it
+
+    def of(self, reading: Reading) -> float | None:
+        return number(self.raw(reading))
+
+    def fault(self, reading: Reading) -> str:
+        """Return the words for a value that is not finite."""
+        value = self.raw(reading)
+        if value is None or isfinite(value):
+            return ''
+        return 'NaN received' if isnan(value) else f'{value} received'
 
 
 def _joint(topic: contract.Topic, joint: str, part: int = 0) -> Signal:
     """Return position, velocity or effort (part 0, 1 or 2) of a joint as a signal."""
 
-    def of(reading: Reading) -> float | None:
-        found = reading.joint(joint)
-        return None if found is None else number(found[part])
+    def raw(reading: Reading) -> float | None:
+        k = reading.names.index(joint) if joint in reading.names else None
+        values = reading.values[part]
+        return None if k is None or k >= len(values) else values[k]
 
-    return Signal(topic.name, of)
+    return Signal(topic.name, raw)
 
 
 def _axis(topic: contract.Topic, axis: int) -> Signal:
-    return Signal(topic.name, lambda reading: number(reading.values[0][axis]))
+    return Signal(topic.name, lambda reading: reading.values[0][axis])
 
 
 #: Signals of the charts by name.
@@ -142,6 +156,9 @@ SIGNALS: Final = {
 
 #: Signals of a frame.
 _SHOWN: Final = ('depth', 'velocity', 'force', 'reference', 'error', 'roll')
+
+#: Signals whose faults a frame has.
+_EXPLAINED: Final = ('depth', 'velocity', 'force', 'error', 'tip_x', 'tip_z')
 
 #: Force without a sensor: the effort that the robot reports.
 EFFORT: Final = _joint(contract.JOINT_STATES, contract.INSERTION, 2)
@@ -179,16 +196,28 @@ def line(points: FloatArray) -> list[list[float]]:
 
 
 class View:
-    """Newest message of each topic; all times, also the timeout `silent`, are of one clock [s]."""
+    """
+    Newest message of each topic; all times, also the timeout `silent`, are of one clock [s].
 
-    def __init__(self, silent: float = 1.0) -> None:
+    Without a `robot` the configuration of the controller is that of the robot.
+    """
+
+    def __init__(self, silent: float = 1.0, robot: WatchedRobot | None = None) -> None:
         #: Number of unreadable messages.
         self.invalid = 0
         #: Needle, tissue and limits.
         self.scene = scene({})
+        #: Units, joints and frames of the measurements.
+        self.robot = WatchedRobot() if robot is None else robot
+        self._follows = robot is None
         self._silence = silent
-        #: Newest reading of each topic and its time of arrival.
+        #: Newest reading of each topic in the contract, and its time of arrival.
         self._readings: dict[str, tuple[float, Reading]] = {}
+        #: Fault of the newest reading, and of the newest message without the insertion joint.
+        self._faults: dict[str, str] = {}
+        self._unusable: dict[str, str] = {}
+        #: Newest stamp of each topic [ns], and the time of its first message.
+        self._stamps: dict[str, tuple[int, float]] = {}
         self._lines: dict[str, tuple[float, list[list[float]]]] = {}
         self._expected: dict[str, Any] | None = None
         self._configurations: dict[str, dict[str, Any]] = {}
@@ -197,8 +226,23 @@ class View:
     # Input.
 
     def reading(self, topic: str, reading: Reading, now: float) -> None:
-        """Store a reading of a topic, by its name in the contract, at a time [s]."""
-        self._readings[topic] = now, reading
+        """
+        Store a reading of a topic, by its name in the contract, at a time [s].
+
+        One without the insertion joint, of another publisher, does not replace a reading with it.
+        """
+        try:
+            self._readings[topic] = now, self.robot.reading(topic, reading)
+        except ParameterError as error:
+            self._unusable[topic] = str(error)
+            return
+        self._faults[topic] = self.robot.fault(topic, reading)
+        if reading.stamp != self._stamps.get(topic, (None, now))[0]:
+            self._stamps[topic] = reading.stamp, now
+
+    def lacks_joint(self, topic: str) -> bool:
+        """Whether a publisher of a topic does not publish the insertion joint."""
+        return topic in self._unusable
 
     def line(self, name: str, points: FloatArray, now: float) -> None:
         """Store a line of ``needle_shape``, ``needle`` or ``path``, with points (n, 3) [m]."""
@@ -224,6 +268,9 @@ class View:
         if not parameters:
             self.invalid += 1
         elif parameters != self._configurations.get(node):
+            if node == 'controller' and self._follows:
+                self.robot.configure(parameters)
+                self._unusable.clear()
             self._configurations[node] = parameters
             self.scene = scene(self._configurations)
 
@@ -249,6 +296,8 @@ class View:
             'hit_probability': self._hit_probability(),
             **self._shape(values['depth'], guide, tip, now),
             'silent': self._silent(now),
+            'faults': self._reasons(now),
+            'robot': self.robot.words,
             'nodes': self._node_rows(now),
             'invalid': self.invalid,
         }
@@ -312,6 +361,27 @@ class View:
             for name, age in ages.items()
             if age > self._silence and name != contract.TARGET.name
         }
+
+    def _reasons(self, now: float) -> dict[str, str]:
+        """Return why a value is missing or not to be trusted, by the name of its signal."""
+        silent, found = self._silent(now), {}
+        for name in _EXPLAINED:
+            signal = signal_of(name, self._readings)
+            topic = signal.topic
+            _, reading = self._readings.get(topic, (0.0, None))
+            if reading is None or topic in silent:
+                reason = self._unusable.get(topic, '') if name == 'depth' else ''
+            else:
+                reason = signal.fault(reading) or self._faults[topic] or self._standing(topic, now)
+            if reason:
+                found[name] = reason
+        return found
+
+    def _standing(self, topic: str, now: float) -> str:
+        stamp, since = self._stamps[topic]
+        if not self.robot.stamped(topic) or now - since <= self._silence:
+            return ''
+        return f'{topic}: the stamp {stamp / NANOSECONDS:.3f} s does not advance'
 
     def _node_rows(self, now: float) -> list[dict[str, Any]]:
         """Return the status of each node, sorted by level, the worst first."""

@@ -11,13 +11,14 @@ import os
 from time import monotonic
 from typing import Any, Final
 
+from needle_controller.hardware_node import named
 from needle_insertion.graph.messages import waiting
 from needle_insertion.live.operator import Operator, RequestOutcome
 from needle_insertion.watch.recorded import STREAMS
 from needle_insertion.watch.view import CONFIGURED, View
 from needle_ros import contract
 from needle_ros.contract import Qos, Topic
-from needle_ros.errors import JobError, MessageError
+from needle_ros.errors import JobError, MessageError, ParameterError
 from needle_ros.network import domain_of, stay_local
 from needle_ros.parameter_file import parameters_in
 from needle_ros.status import read_reports
@@ -27,6 +28,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 
 _NEWEST: Final = contract.SENSOR._replace(depth=1)  #: QoS for the newest message only
+_SEVERAL: Final = contract.SENSOR  #: QoS for a topic of several publishers
 _LINES: Final = contract.SENSOR._replace(depth=4)  #: QoS for needle and path of two pictures
 
 #: Timeout of a target, including planning, and polling period of answers [s].
@@ -53,14 +55,12 @@ class WatchNode(Node):
     def __init__(self, view: View, context: Context) -> None:
         super().__init__('watch', context=context, **_QUIET)
         self._view = view
-        self._takers: list[tuple[Callable[[], Iterator[Any]], Callable[[Any, float], None]]] = []
+        self._takers: dict[str, tuple[Callable[[], Iterator[Any]], Callable[[Any, float], None]]]
+        self._takers = {}
+        #: Topic and QoS of each measurement, and its subscription.
+        self._streams: dict[str, tuple[str, Qos, Any]] = {}
         for topic in STREAMS:
-            read = MessageReader(topic.type_name).read
-
-            def take(data: bytes, now: float, name: str = topic.name, read: Any = read) -> None:
-                view.reading(name, read(data), now)
-
-            self._listen(topic, _NEWEST, take)
+            self._listen_to_robot(topic)
         self._listen(
             contract.NEEDLE_SHAPE, _LINES, lambda data, now: view.line(*read_line(data), now)
         )
@@ -72,10 +72,35 @@ class WatchNode(Node):
         )
         self._listen(contract.DIAGNOSTICS, _STATUSES, self._on_diagnostics, raw=False)
 
+    def _listen_to_robot(self, topic: Topic) -> None:
+        """Subscribe to a measurement, again if the topic of the robot or its QoS has changed."""
+        name, view = self._view.robot.topic(topic.name), self._view
+        qos = _SEVERAL if view.lacks_joint(topic.name) else _NEWEST
+        known, used, subscription = self._streams.get(topic.name, ('', qos, None))
+        if (known, used) == (name, qos):
+            return
+        if subscription is not None:
+            self.destroy_subscription(subscription)
+        try:
+            own = named(topic, name, topic.type_name)
+        except ParameterError as error:
+            own, view.robot.words = topic, str(error)
+        read = MessageReader(topic.type_name).read
+        self._listen(
+            own, qos, lambda data, now: view.reading(topic.name, read(data), now), topic.name
+        )
+        self._streams[topic.name] = name, qos, [*self.subscriptions][-1]
+
     def _listen(
-        self, topic: Topic, qos: Qos, take: Callable[[Any, float], None], *, raw: bool = True
+        self,
+        topic: Topic,
+        qos: Qos,
+        take: Callable[[Any, float], None],
+        name: str = '',
+        *,
+        raw: bool = True,
     ) -> None:
-        self._takers.append((waiting(self, topic, qos, raw=raw), take))
+        self._takers[name or topic.name] = waiting(self, topic, qos, raw=raw), take
 
     def _configured(self, node: str, data: bytes, _now: float) -> None:
         self._view.configuration(node, parameters_in(read_string(data)))
@@ -86,7 +111,9 @@ class WatchNode(Node):
 
     def poll(self, now: float) -> None:
         """Process waiting messages at a time of a steady clock [s]."""
-        for waiting_messages, take in self._takers:
+        for topic in STREAMS:
+            self._listen_to_robot(topic)
+        for waiting_messages, take in self._takers.values():
             for message in waiting_messages():
                 try:
                     take(message, now)

@@ -110,7 +110,7 @@ def test_frame_of_any_measurement_is_json(
     view = View()
     view.reading('joint_states', joints(('insertion',) * count, tuple(values), (), ()), 0.0)
     view.reading('tip_deflection', numbers(*values), 0.0)
-    view.reading('base_wrench', numbers(*values), 0.0)
+    view.reading('base_wrench', numbers(*values, *values), 0.0)
     view.line('needle', np.array([values, [0.0, 0.1, 0.0]]), 0.0)
     view.expected(expected(values[0], values[1], deviation))
     said = json.loads(json.dumps(view.frame(0.0), allow_nan=False))

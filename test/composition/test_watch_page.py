@@ -6,8 +6,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Coroutine
 from functools import wraps
+from math import nan
 from typing import Any
 
+from needle_ros.wire import Reading
 import pytest
 from support.live_page import joints, live_page
 from tools.browser import BROWSER
@@ -68,4 +70,27 @@ async def test_any_reading_leaves_the_page_usable() -> None:
         assert found['again'] == [60, 10]
         page.feed['joint_states'] = joints('insertion')
         await tab.wait("document.getElementById('far').hidden", 'the next reading')
+        assert tab.faults == []
+
+
+@in_loop
+async def test_reason_is_beside_the_number() -> None:
+    """Missing joint, wrong frame, and values that are not finite; invalid messages are counted."""
+    numbers = "document.getElementById('numbers').innerText"
+    async with live_page(joint_states=joints('arm', 'wrist')) as (page, tab):
+        reason = "joint_states has no joint 'insertion'; joints found: 'arm', 'wrist'"
+        await tab.wait(f'{numbers}.includes("{reason}")', 'the joints')
+        await tab.wait(f'{text("shape")}.includes("{reason}")', 'the reason')
+        page.feed['joint_states'] = joints('insertion')
+        page.feed['base_wrench'] = Reading(1, 'camera', (), ((0.0, 7.0, 0.0, 0.0, 0.0, 0.0),))
+        page.feed['tip_deflection'] = Reading(1, 'needle_entry', (), ((nan, 0.05, 1e-3),))
+        page.view.invalid = 3
+        frame = "■ base_wrench must be in frame 'needle_base', got 'camera'"
+        await tab.wait(f'{numbers}.includes("{frame}")', 'the frame')
+        # The value is shown with it.
+        assert '7.00 N' in await tab.run(numbers)
+        assert '■ NaN received' in await tab.run(numbers)
+        await tab.wait(f"{text('invalid')}.startsWith('3 invalid messages received')", 'the count')
+        page.feed.clear()
+        await tab.wait(f"{numbers}.includes('○ silent for')", 'silence')
         assert tab.faults == []

@@ -46,19 +46,19 @@ function make(tag, text = '', kind = '') {
 /* Numbers with their limits. */
 
 const QUANTITIES = [
-  {name: 'Insertion depth', unit: 'mm', digits: 2, of: (f) => mm(f.depth), stream: 'joint_states',
+  {name: 'Insertion depth', signal: 'depth', unit: 'mm', digits: 2, of: (f) => mm(f.depth), stream: 'joint_states',
     range: (l) => ('low' in l && 'high' in l ? [mm(l.low), mm(l.high)] : null)},
-  {name: 'Velocity', unit: 'mm/s', digits: 1, of: (f) => mm(f.velocity), stream: 'joint_states',
+  {name: 'Velocity', signal: 'velocity', unit: 'mm/s', digits: 1, of: (f) => mm(f.velocity), stream: 'joint_states',
     range: (l) => ('speed' in l ? [-mm(l.speed), mm(l.speed)] : null)},
-  {name: 'Force', unit: 'N', digits: 2, of: (f) => f.force, stream: 'base_wrench',
+  {name: 'Force', signal: 'force', unit: 'N', digits: 2, of: (f) => f.force, stream: 'base_wrench',
     range: (l) => ('load' in l ? [-l.load, l.load] : null),
     marks: (l) => ('force' in l ? [-l.force, l.force] : []),
     more: (l) => ('force' in l ? `, commanded ±${fixed(l.force, 0)}` : '')},
-  {name: 'Tracking error', unit: 'mm', digits: 3, of: (f) => mm(f.error), stream: 'tracking_error',
+  {name: 'Tracking error', signal: 'error', unit: 'mm', digits: 3, of: (f) => mm(f.error), stream: 'tracking_error',
     range: (l) => ('error' in l ? [-mm(l.error), mm(l.error)] : null)},
-  {name: 'Tip x', unit: 'mm', digits: 2, of: (f) => (f.tip ? mm(f.tip[0]) : null), stream: 'tip_deflection',
+  {name: 'Tip x', signal: 'tip_x', unit: 'mm', digits: 2, of: (f) => (f.tip ? mm(f.tip[0]) : null), stream: 'tip_deflection',
     range: (l) => ('deflection' in l ? [-mm(l.deflection), mm(l.deflection)] : null)},
-  {name: 'Tip z', unit: 'mm', digits: 2, of: (f) => (f.tip ? mm(f.tip[2]) : null), stream: 'tip_deflection',
+  {name: 'Tip z', signal: 'tip_z', unit: 'mm', digits: 2, of: (f) => (f.tip ? mm(f.tip[2]) : null), stream: 'tip_deflection',
     range: (l) => ('deflection' in l ? [-mm(l.deflection), mm(l.deflection)] : null)},
 ];
 
@@ -78,13 +78,25 @@ for (const one of QUANTITIES) {
   find('numbers').querySelector('dl').append(one.box);
 }
 
+/* Why a number is missing or not to be trusted: level and words, null if it is fine. */
+function doubt(one) {
+  const fault = frame.faults[one.signal];
+  /* Without a force sensor the force is the effort in joint_states. */
+  const stream = one.signal === 'force' && !frame.sensed ? 'joint_states' : one.stream;
+  const age = frame.silent[stream];
+  const silent = age === undefined ? '' : `silent for ${fixed(age, 0)} s`;
+  if (fault) return ['error', `■ ${silent}${silent && ': '}${fault}`];
+  return silent ? ['silent', `○ ${silent}`] : null;
+}
+
 function show(one) {
-  const value = one.of(frame), range = one.range(scene.limits), age = frame.silent[one.stream];
+  const value = one.of(frame), range = one.range(scene.limits), doubted = doubt(one);
   put(one.value, fixed(value, one.digits));
   one.meter.hidden = range === null;
   if (range === null) {
-    put(one.limit, age === undefined ? 'limit unknown' : `silent for ${fixed(age, 0)} s`);
-    level(one.box, age === undefined ? 'fine' : 'silent');
+    const [state, words] = doubted || ['fine', 'limit unknown'];
+    put(one.limit, words);
+    level(one.box, state);
     return;
   }
   const [low, high] = range, share = (at) => 100 * Math.min(1, Math.max(0, (at - low) / (high - low)));
@@ -111,12 +123,17 @@ function show(one) {
     state = 'warning';
     words = `▲ near ${words}`;
   }
-  if (age !== undefined) {
-    state = 'silent';
-    words = `○ silent for ${fixed(age, 0)} s`;
-  }
+  if (doubted) [state, words] = doubted;
   put(one.limit, words);
   level(one.box, state);
+}
+
+/* What the page does not show. */
+function tellInvalid() {
+  const words = [frame.robot];
+  if (frame.invalid) words.push(`${frame.invalid} invalid messages received, which are not shown`);
+  put(find('invalid'), words.filter((one) => one).join('; '));
+  find('invalid').hidden = !find('invalid').textContent;
 }
 
 /* Charts. */
@@ -215,7 +232,7 @@ function tellShape() {
   const of = scene.tissue ? ` Tissue from the configuration of the node ${scene.tissue.of}.` : ' No configuration of needle and tissue received.';
   const words = frame.shape === 'straight'
     ? `The shape of the needle is not measured: the dashed line is straight from the guide to the tip.${of}`
-    : frame.shape === null ? 'Needle position unknown: no joint_states received.' : '';
+    : frame.shape === null ? `Needle position unknown: ${frame.faults.depth || 'no joint_states received'}.` : '';
   find('shape').hidden = words === '';
   put(find('shape'), words);
   const far = drawing.left.join(', ');
@@ -236,6 +253,7 @@ function say() {
   changed = false;
   worded = performance.now();
   QUANTITIES.forEach(show);
+  tellInvalid();
   tellNodes();
   tellAim();
   tellShape();
