@@ -66,11 +66,18 @@ class LiveReader:
         self._scene: dict[str, Any] = {}
 
     async def next(self) -> str:
-        """Wait for the next newer frame; return it, with the scene if it has changed, as JSON."""
+        """
+        Wait for the next newer frame; return it as JSON.
+
+        It has the scene if it has changed, and the rows since the previous frame.
+        """
         live, first = self._live, self._number == 0
         await live.newer(self._number)
+        missed = min(live.number - self._number, len(live.history)) - 1
         self._number = live.number
         parts = [f'"frame":{live.frame}']
+        if missed and not first:
+            parts.append(f'"missed":{_json([*live.history][-missed - 1 : -1])}')
         if first or live.scene is not self._scene:
             self._scene = live.scene
             parts.append(f'"scene":{_json(self._scene)}')

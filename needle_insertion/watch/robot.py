@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings of a robot with topics, joints and units of its own, in those of the contract."""
+"""Conversion of the readings of any robot to the topics, joints and units of the contract."""
 
 from collections.abc import Mapping
 from typing import Any, Final

@@ -20,15 +20,19 @@ from functools import partial
 from hmac import compare_digest
 from ipaddress import ip_address
 import json
+import logging
 from pathlib import Path
 from secrets import token_urlsafe
+import sys
+from time import monotonic
 from typing import Any, Final, Protocol
 from urllib.parse import urlsplit
 
 from aiohttp import web, WSCloseCode, WSMessage, WSMsgType
+from aiohttp.http import HttpProcessingError
 from needle_insertion.live.requests import REQUESTS
 from needle_insertion.report.page import TEMPLATE_FOLDER
-from needle_ros.errors import JobError, NeedleError, ParameterError, printable
+from needle_ros.errors import JobError, NeedleError, ParameterError, printable, shown
 from needle_ros.settings import is_number
 
 PORT: Final = 8642  #: default port
@@ -41,6 +45,13 @@ LONGEST: Final = 4096
 _AHEAD: Final = 2
 _MOST_ASKED: Final = 8
 
+#: Commands that may begin or permit a motion, and the largest time since their click [s].
+_MOVING: Final = ('target', 'resume', 'retract', 'clear')
+_LATE: Final = 1.0
+
+_CHECK: Final = 'check'  #: Request without effect, which tells a page whether its token is valid.
+_BEAT: Final = 0.25  #: period of the clock that a page receives, also without frames [s]
+
 _PATIENCE: Final = 10.0  #: timeout of a reader that accepts no data [s]
 _HEARTBEAT: Final = 20.0  #: period of the heartbeat of a WebSocket [s]
 
@@ -50,8 +61,10 @@ _PAGE: Final = Path(__file__).with_name('page')
 _FILES: Final = {
     '/': (_PAGE / 'watch.html', 'text/html'),
     '/watch.css': (_PAGE / 'watch.css', 'text/css'),
-    '/charts.js': (_PAGE / 'charts.js', 'text/javascript'),
-    '/watch.js': (_PAGE / 'watch.js', 'text/javascript'),
+    **{
+        f'/{name}.js': (_PAGE / f'{name}.js', 'text/javascript')
+        for name in ('charts', 'connection', 'watch')
+    },
     **{
         f'/anatomy.{kind}': (TEMPLATE_FOLDER / f'anatomy.{kind}', f'text/{name}')
         for kind, name in (('js', 'javascript'), ('css', 'css'))
@@ -154,7 +167,7 @@ class Server:
         app.router.add_get('/anatomy.json', partial(_answer, self._anatomy))
         app.router.add_get('/frames', self._frames)
         app.on_shutdown.append(self._close)
-        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0, logger=_logger())
         await self._runner.setup()
         site = web.TCPSite(self._runner, self._host, self._port)
         try:
@@ -217,25 +230,28 @@ class Server:
     # Readers.
 
     async def _frames(self, request: web.Request) -> web.StreamResponse:
-        if len(self._open) >= MOST_READERS:
-            return web.Response(
-                status=503, text=f'{MOST_READERS} pages are open already\n', headers=_HEADERS
-            )
         socket = web.WebSocketResponse(
             max_msg_size=LONGEST, heartbeat=_HEARTBEAT, compress=False, timeout=1.0
         )
+        full = len(self._open) >= MOST_READERS
         await socket.prepare(request)
+        if full:
+            # A browser does not tell its page the status of a rejected request.
+            reason = f'{MOST_READERS} pages are open already: close one, then load this page again'
+            await socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=reason.encode())
+            return socket
         self._open.add(socket)
         connection = _Connection(socket, self._readers())
-        sending = asyncio.create_task(connection.send())
-        # A reader that accepts no data would block `close`.
-        sending.add_done_callback(lambda _: _break_off(request))
+        sending = [asyncio.create_task(one()) for one in (connection.send, connection.beat)]
+        for task in sending:
+            # A reader that accepts no data would block `close`.
+            task.add_done_callback(lambda _: _break_off(request))
         try:
             async for message in socket:
                 await self._take(connection, message)
         finally:
             self._open.discard(socket)
-            for task in (sending, *connection.asking):
+            for task in (*sending, *connection.asking):
                 task.cancel()
         return socket
 
@@ -259,7 +275,11 @@ class Server:
         given = token.encode(errors='replace') if isinstance(token, str) else b''
         if not compare_digest(given, self.token.encode()):
             raise ParameterError('wrong token: open the URL printed by needle watch')
-        what = message.pop('ask')
+        what, clicked = message.pop('ask'), message.pop('clicked', None)
+        if what == _CHECK and not message:
+            return True, ''
+        if what in _MOVING:
+            _check_age(clicked)
         if what == 'target':
             at = message.pop('at', None)
             if message or not isinstance(at, list) or len(at) != 3 or not all(map(is_number, at)):
@@ -285,6 +305,11 @@ class _Connection:
         for _ in range(min(number, self._ahead)):
             self._ahead -= 1
             self._credit.release()
+
+    async def beat(self) -> None:
+        """Send the clock of commands: a page without it reports an interruption."""
+        while await self._put(json.dumps({'clock': round(monotonic(), 3)})):
+            await asyncio.sleep(_BEAT)
 
     async def send(self) -> None:
         while True:
@@ -320,6 +345,37 @@ class _Connection:
         except (ConnectionError, asyncio.TimeoutError):
             return False
         return True
+
+
+def _check_age(clicked: object) -> None:
+    """Raise an error if a command is older than `_LATE` by the clock of the page."""
+    if not is_number(clicked) or clicked > monotonic() + _LATE:
+        raise ParameterError(
+            f'a command needs "clicked", the last "clock" plus the time since then [s], got '
+            f'{clicked!r}'
+        )
+    if (age := monotonic() - clicked) > _LATE:
+        raise JobError(
+            f'not executed: the click was {age:.1f} s ago, before an interruption of the '
+            'connection; click again if it is still wanted'
+        )
+
+
+class _OneLine(logging.Handler):
+    """Print rejected requests as one line, and errors of this program with their traceback."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        text = self.format(record)
+        if isinstance(error, HttpProcessingError):
+            text = shown(f'warning: request rejected: {error.message.partition(chr(10))[0]}')
+        sys.stderr.write(f'{text}\n')
+
+
+def _logger() -> logging.Logger:
+    logger = logging.getLogger(__name__)
+    logger.propagate, logger.handlers = False, [_OneLine()]
+    return logger
 
 
 def _break_off(request: web.Request) -> None:

@@ -199,7 +199,7 @@ class View:
     """
     Newest message of each topic; all times, also the timeout `silent`, are of one clock [s].
 
-    Without a `robot` the configuration of the controller is that of the robot.
+    Without a `robot`, the configuration of the controller describes it.
     """
 
     def __init__(self, silent: float = 1.0, robot: WatchedRobot | None = None) -> None:

@@ -9,6 +9,8 @@ from functools import wraps
 from math import nan
 from typing import Any
 
+from aiohttp import ClientSession
+from needle_insertion.watch.server import MOST_READERS
 from needle_ros.wire import Reading
 import pytest
 from support.live_page import joints, live_page
@@ -94,3 +96,91 @@ async def test_reason_is_beside_the_number() -> None:
         page.feed.clear()
         await tab.wait(f"{numbers}.includes('○ silent for')", 'silence')
         assert tab.faults == []
+
+
+#: Numbers of a row after its time, all equal.
+ROW = 'Array(12).fill(0.05)'
+
+
+@in_loop
+async def test_pause_of_frames_is_a_gap() -> None:
+    """Not a line; rows without a pause have none."""
+    async with live_page(joint_states=joints('insertion')) as (_, tab):
+        for last, gaps in ((1.4, 0), (2.5, 1)):
+            rows = ', '.join(f'[{time}, ...{ROW}]' for time in (1.0, 1.1, last))
+            found = await tab.run(f'(charts.live([{rows}]), charts.data.depth[1])')
+            assert found.count(None) == gaps
+            assert found[-1] == 0.05
+
+
+@in_loop
+async def test_missed_rows_arrive_with_the_next_frame() -> None:
+    """A page in the background draws nothing: then its charts have all rows of this time."""
+    async with live_page(joint_states=joints('insertion')) as (page, tab):
+        await tab.run('window.before = requestAnimationFrame, requestAnimationFrame = () => 0')
+        await tab.run('(waiting = true, charts.live([]))')
+        first = page.live.number
+        await page.live.newer(first + 40)
+        expected = [row[0] for row in page.live.history][-30:]
+        await tab.run('(requestAnimationFrame = before, waiting = false, later())')
+        last = f'charts.data.depth[0].some((time) => time > {expected[-1]})'
+        await tab.wait(last, 'the missed rows')
+        assert {*expected} <= {*await tab.run('charts.data.depth[0]')}
+        assert tab.faults == []
+
+
+#: Whether a wheel event over a chart is used, and not left to the browser.
+WHEEL = """((options) => {
+  const event = new WheelEvent('wheel', {cancelable: true, bubbles: true, ...options});
+  document.querySelector('#strips canvas').dispatchEvent(event);
+  return event.defaultPrevented;
+})"""
+
+
+@in_loop
+async def test_wheel_is_left_to_the_browser_where_nothing_is_zoomed() -> None:
+    """Zoom of the browser, sideways scrolling, and at both ends of the zoom."""
+    async with live_page(joint_states=joints('insertion')) as (_, tab):
+        for options, used in (
+            ('{deltaY: 100}', False),
+            ('{deltaY: -100, ctrlKey: true}', False),
+            ('{deltaY: -50, deltaX: 60}', False),
+            ('{deltaY: -100, deltaX: 10}', True),
+            ('{deltaY: 100}', True),
+            ('{deltaY: 100}', False),
+        ):
+            assert await tab.run(f'{WHEEL}({options})') is used, options
+        for _ in range(10):
+            await tab.run(f'{WHEEL}({{deltaY: -100}})')
+        assert await tab.run(f'{WHEEL}({{deltaY: -100}})') is False
+
+
+@in_loop
+async def test_signals_without_data_cannot_be_chosen() -> None:
+    """Until their first value."""
+    box = "document.querySelector('#signals [name={}]').disabled"
+    async with live_page(joint_states=joints('insertion')) as (page, tab):
+        await tab.wait(f'!{box.format("depth")}', 'the depth')
+        assert await tab.run(box.format('roll'))
+        assert await tab.run(box.format('tip_x'))
+        page.feed['joint_states'] = joints('insertion', 'roll')
+        await tab.wait(f'!{box.format("roll")}', 'the roll')
+        assert await tab.run(box.format('tip_x'))
+
+
+@in_loop
+async def test_page_above_the_limit_states_the_reason() -> None:
+    async with live_page() as (page, tab):
+        address = page.server.address
+        async with ClientSession() as session:
+            others = range(MOST_READERS - 1)
+            streams = [await session.ws_connect(f'{address}frames') for _ in others]
+            await tab.run(
+                '(() => { const one = new needleConnection.Connection(connection.url, () => null, '
+                '() => null); window.second = one; })()'
+            )
+            reason = await tab.wait('second.refused', 'the reason')
+            assert reason == await tab.run('second.trouble()')
+            assert reason.startswith(f'{MOST_READERS} pages are open already')
+            for stream in streams:
+                await stream.close()

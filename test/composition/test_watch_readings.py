@@ -56,7 +56,7 @@ def state(names: Sequence[str], position: float, velocity: float, effort: float)
     st.permutations(['other', 'slide', 'insertion']),
     st.sampled_from(['x', '-y', 'z']),
 )
-def test_numbers_are_those_of_the_controller(
+def test_numbers_are_converted_as_in_the_controller(
     sign: float, scale: float, zero: float, position: float, velocity: float, effort: float,
     names: list[str], axis: str,
 ) -> None:  # fmt: skip
@@ -192,7 +192,7 @@ def test_invalid_robot_is_reported() -> None:
     assert view.frame(0.0)['depth'] == 0.05
 
 
-def test_settings_are_those_of_the_parameters() -> None:
+def test_settings_follow_from_parameters() -> None:
     """Given values replace them; an invalid one is named with its prefix."""
     settings = HardwareSettings(**STAGE)
     assert settings_in(parameters(STAGE)) == settings

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
+from time import monotonic
 from typing import Any
 
 from aiohttp import ClientSession, ClientWebSocketResponse
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 from support.anatomies import plan_of
 from support.installed import ROOT
+from support.live_page import watching
 from support.ros_graph import RosGraph
 from support.watched import write_watched
 from tools.browser import BROWSER, browser, Tab
@@ -33,25 +35,6 @@ CONTROLLER = {
 }  # fmt: skip
 
 needs_browser = pytest.mark.skipif(BROWSER is None, reason='no Chromium on this machine')
-
-
-@contextmanager
-def watching(environment: dict[str, str], *words: str) -> Iterator[tuple[Any, str]]:
-    """Start `needle watch`; return its process and the URL of its page."""
-    running = subprocess.Popen(
-        [sys.executable, '-m', 'needle_insertion.cli', 'watch', '--port', '0', *words],
-        env={**environment, 'PYTHONPATH': str(ROOT)},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert running.stdout is not None
-        line = running.stdout.readline()
-        assert line.startswith('page: http://127.0.0.1:'), line
-        yield running, line.removeprefix('page: ').strip()
-    finally:
-        running.kill()
-        running.communicate()
 
 
 class Reader:
@@ -81,7 +64,8 @@ class Reader:
 
     async def ask(self, what: str, **more: Any) -> dict[str, Any]:
         """Send a command, and return the answer."""
-        await self._stream.send_json({'ask': what, 'token': self._token, **more})
+        proof = {'token': self._token, 'clicked': monotonic()}
+        await self._stream.send_json({'ask': what, **proof, **more})
         while True:
             message = await self._next()
             if 'answer' in message:

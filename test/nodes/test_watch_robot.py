@@ -69,7 +69,7 @@ def test_invalid_topic_of_the_robot_is_reported(ros_graph: RosGraph) -> None:
         node.destroy_node()
 
 
-def test_rare_publisher_of_the_joint_is_shown_among_frequent_ones(ros_graph: RosGraph) -> None:
+def test_depth_of_a_slow_publisher_is_shown_with_a_fast_publisher(ros_graph: RosGraph) -> None:
     """Its message, the first of 20 since the last poll, is not replaced by those of an arm."""
     drivers = ros_graph.node('arm'), ros_graph.node('stage')
     arm, stage = (one.create_publisher(JointState, 'joint_states', 10) for one in drivers)

@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
+import subprocess
+import sys
 from typing import Any
 
 from needle_insertion.watch.live import Live, LiveReader
 from needle_insertion.watch.server import Server
 from needle_insertion.watch.view import View
 from needle_ros.wire import Reading
+from support.installed import ROOT
 from tools.browser import browser, Tab
 
 
@@ -44,6 +47,25 @@ class LivePage:
             with suppress(asyncio.CancelledError):
                 await self._running
         await self.server.end()
+
+
+@contextmanager
+def watching(environment: dict[str, str], *words: str) -> Iterator[tuple[Any, str]]:
+    """Start `needle watch`; return its process and the URL of its page."""
+    running = subprocess.Popen(
+        [sys.executable, '-m', 'needle_insertion.cli', 'watch', '--port', '0', *words],
+        env={**environment, 'PYTHONPATH': str(ROOT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert running.stdout is not None
+        line = running.stdout.readline()
+        assert line.startswith('page: http://127.0.0.1:'), line
+        yield running, line.removeprefix('page: ').strip()
+    finally:
+        running.kill()
+        running.communicate()
 
 
 @asynccontextmanager

@@ -13,6 +13,8 @@ const needleCharts = (() => {
   const HEIGHT = 150, LEFT = 44, RIGHT = 8, TOP = 6, BOTTOM = 20;
   /* Duration of a live chart, and shortest duration [s]; zoom factor; a drag [pixels]. */
   const SPAN = 20, SHORTEST = 0.02, ZOOM = 1.5, DRAG = 4;
+  /* Pause of live rows that is a gap [s]. */
+  const PAUSE = 0.5;
 
   /* Charts: name, unit, factor from SI, smallest range, and signals with words and line. */
   const CHARTS = [
@@ -76,6 +78,7 @@ const needleCharts = (() => {
       this.data = {};
       this.now = 0;
       this.other = {};
+      this.known = new Set();  /* signals with a value so far */
       /* First and last time of a recording; null: live. */
       this.ends = null;
       this.span = SPAN;
@@ -124,6 +127,7 @@ const needleCharts = (() => {
     /* Show a recording of a duration with its signals, {name: [times, values]}, and another. */
     record(signals, duration, other) {
       this.data = signals;
+      this.known.clear();
       this.other = other ? other.signals : {};
       this.last = other ? other.end : duration;
       this.ends = other ? [Math.min(0, other.begin), Math.max(duration, other.end)] : [0, duration];
@@ -134,19 +138,32 @@ const needleCharts = (() => {
     live(rows) {
       this.data = Object.fromEntries(ROW.map((name) => [name, [[], []]]));
       this.ends = null;
+      this.known.clear();
       rows.forEach((row) => this.push(row));
     }
 
     push([time, ...values]) {
       ROW.forEach((name, k) => {
         const [times, column] = this.data[name];
-        if (times.length && time <= times[times.length - 1]) return;
+        const last = times.length ? times[times.length - 1] : time - 1e-3;
+        if (time <= last) return;
+        if (time - last > PAUSE) {
+          times.push(time);
+          column.push(null);
+        }
         times.push(time);
         column.push(values[k]);
         const old = upTo(times, time - SPAN - 1);
         times.splice(0, old);
         column.splice(0, old);
       });
+    }
+
+    /* Whether a signal has had a value. */
+    has(name) {
+      if (!this.known.has(name) && [this.data, this.other].some((data) => data[name]
+        && data[name][1].some((value) => value !== null))) this.known.add(name);
+      return this.known.has(name);
     }
 
     /* Value of a signal at a time: its newest one, null in a gap. */
@@ -174,8 +191,9 @@ const needleCharts = (() => {
       this.from = Math.min(Math.max(first, from), first + all - this.span);
     }
 
-    /* Change the duration by a factor, about a time. */
+    /* Change the duration by a factor, about a time; return whether it changes. */
     zoom(factor, about) {
+      const before = this.span;
       if (this.ends === null) {
         this.span = Math.min(SPAN, Math.max(1, this.span / factor));
       } else {
@@ -184,6 +202,7 @@ const needleCharts = (() => {
         this.show(time - (time - from) / factor, time + (to - time) / factor);
       }
       this.changed();
+      return this.span !== before;
     }
 
     /* Pointer and keys. */
@@ -219,8 +238,9 @@ const needleCharts = (() => {
         this.changed();
       });
       canvas.addEventListener('wheel', (event) => {
-        event.preventDefault();
-        this.zoom(event.deltaY < 0 ? ZOOM : 1 / ZOOM, this.time(canvas, event));
+        /* Zoom of the browser, and scrolling: sideways, and at the end of the zoom. */
+        if (event.ctrlKey || Math.abs(event.deltaX) >= Math.abs(event.deltaY)) return;
+        if (this.zoom(event.deltaY < 0 ? ZOOM : 1 / ZOOM, this.time(canvas, event))) event.preventDefault();
       }, {passive: false});
     }
 
@@ -245,6 +265,7 @@ const needleCharts = (() => {
     draw(now, limits) {
       this.now = now;
       for (const chart of CHARTS) {
+        for (const [name, tick] of Object.entries(chart.chosen)) tick.disabled = !this.has(name);
         const names = this.chosen(chart);
         chart.figure.hidden = !names.length;
         for (const [name, boxes] of Object.entries(chart.values)) {

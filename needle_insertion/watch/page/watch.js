@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 'use strict';
 
-/* Page of `needle watch`: receives frames, draws the newest frame, and acknowledges it. */
+/* Page of `needle watch`: draws the newest frame, acknowledges it, and sends commands. */
 
 const find = (id) => document.getElementById(id);
 const mm = (value) => (value === null ? null : 1e3 * value);
@@ -20,7 +20,7 @@ const drawing = new needleDrawing.Drawing(find('needle'));
 const seen = {frames: 0, drawn: 0, connected: false};
 window.needleWatch = seen;
 
-let socket = null, scene = {limits: {}, tissue: null, steered: false}, setting = null;
+let scene = {limits: {}, tissue: null, steered: false}, setting = null;
 let frame = null, playback = null, waiting = false, worded = 0, drawnAt = 0;
 let anatomy = null, other = null, dragging = false, unseen = 0, saying = 0, changed = true;
 
@@ -80,6 +80,8 @@ for (const one of QUANTITIES) {
 
 /* Why a number is missing or not to be trusted: level and words, null if it is fine. */
 function doubt(one) {
+  const trouble = connection.trouble();
+  if (trouble) return ['silent', `○ ${trouble.split(':')[0]}`];
   const fault = frame.faults[one.signal];
   /* Without a force sensor the force is the effort in joint_states. */
   const stream = one.signal === 'force' && !frame.sensed ? 'joint_states' : one.stream;
@@ -198,6 +200,16 @@ function tellNodes() {
     told = text;
     find('nodes').querySelector('ul').replaceChildren(...frame.nodes.map(tell));
   }
+}
+
+/* The worst state of the nodes, or the state of the connection, which hides it. */
+function tellState() {
+  const trouble = connection.trouble();
+  if (trouble || !frame) {
+    level(find('state'), trouble ? 'error' : 'none');
+    put(find('state'), trouble ? `■ ${trouble}` : 'no data yet');
+    return;
+  }
   const worst = frame.nodes.reduce((state, node) => {
     const name = node.silent ? 'silent' : LEVELS[node.level];
     const rank = ['fine', 'silent', 'warning', 'error'];
@@ -255,6 +267,7 @@ function say() {
   QUANTITIES.forEach(show);
   tellInvalid();
   tellNodes();
+  tellState();
   tellAim();
   tellShape();
   tellCursor();
@@ -301,11 +314,16 @@ function take(message) {
     if (other) put(find('compared'), `Compared with ${other.words}.`);
     charts.record(message.signals, setting.recording.duration, other);
     follow();
+    /* The speed of a page that was open before. */
+    const speed = Number(find('speed').value);
+    if (speed !== playback.speed) send({speed});
   }
   if (!message.frame) return undefined;
   frame = message.frame;
   seen.frames += 1;
   unseen += 1;
+  /* Rows since the previous frame, of a page in the background. */
+  (message.missed || []).forEach((row) => charts.push(row));
   if (frame.row) charts.push(frame.row);
   later(false);
   return undefined;
@@ -318,6 +336,7 @@ function settle(given) {
   drawing.reset();
   find('playback').hidden = setting.recording === null;
   find('control').hidden = !(setting.control && token);
+  if (setting.control && token) send({ask: 'check', token});
   find('looking').hidden = setting.recording !== null || (setting.control && token !== '');
   // Without the token, or without --control.
   const [plain, opened] = find('looking').children;
@@ -349,24 +368,49 @@ find('at').addEventListener('input', (event) => send({at: Number(event.target.va
 
 /* Control. */
 
-function answered({asked, success, words}) {
-  const node = find('answer');
+/* Commands without an answer; whether the server has accepted the token. */
+const asked = new Set();
+let allowed = false;
+
+function answered({asked: what, success, words}) {
+  if (what === 'check') {
+    allowed = success;
+    tellControl();
+    if (success) return;
+  }
+  asked.delete(what);
+  const node = find('answer'), named = what === 'check' ? '' : what;
   level(node, success ? 'fine' : 'error');
-  put(node, `${success ? '●' : '■ refused'} ${asked}${asked && words ? ': ' : ''}${words}`);
+  put(node, `${success ? '●' : '■ refused'} ${named}${named && words ? ': ' : ''}${words}`);
+}
+
+/* Send a command with the time of the click: the server refuses an old one. */
+function ask(what, more = {}) {
+  if (!send({ask: what, token, clicked: connection.now(), ...more})) {
+    answered({asked: what, success: false, words: `not sent, ${connection.trouble()}`});
+    return;
+  }
+  asked.add(what);
+  level(find('answer'), 'none');
+  put(find('answer'), `○ sending ${what} …`);
+}
+
+/* Buttons that would have no effect are disabled, except Stop, which then states the reason. */
+function tellControl() {
+  const works = connection.open && allowed && connection.now() !== null;
+  for (const button of find('control').querySelectorAll('button')) {
+    button.disabled = !works && button.id !== 'stop';
+  }
 }
 
 for (const button of document.querySelectorAll('[data-ask]')) {
-  button.addEventListener('click', () => {
-    if (!send({ask: button.dataset.ask, token})) {
-      answered({asked: button.dataset.ask, success: false, words: 'not connected'});
-    }
-  });
+  button.addEventListener('click', () => ask(button.dataset.ask));
 }
 
 find('target').addEventListener('submit', (event) => {
   event.preventDefault();
   const {x, y, z} = event.target.elements;
-  send({ask: 'target', at: [x, y, z].map((input) => Number(input.value) / 1e3), token});
+  ask('target', {at: [x, y, z].map((input) => Number(input.value) / 1e3)});
 });
 
 window.addEventListener('hashchange', () => {
@@ -379,28 +423,29 @@ window.addEventListener('hashchange', () => {
 
 /* Connection. */
 
-function send(message) {
-  const open = socket !== null && socket.readyState === WebSocket.OPEN;
-  if (open) socket.send(JSON.stringify(message));
-  return open;
+const send = (message) => connection.send(message);
+
+/* The connection has opened, ended, stopped to send, or sent again. */
+function connected() {
+  const {open} = connection, lost = seen.connected && !open;
+  if (open !== seen.connected) {
+    seen.connected = open;
+    unseen = 0;
+    allowed = false;
+    if (open) put(find('answer'), '');
+  }
+  document.body.classList.toggle('quiet', connection.trouble() !== '');
+  tellState();
+  tellControl();
+  if (lost) {
+    const open = [...asked].map((what) => `${what}: no answer, it may have been executed; `).join('');
+    answered({asked: '', success: false, words: `${open}${connection.trouble()}`});
+    asked.clear();
+  }
+  if (frame) QUANTITIES.forEach(show);
 }
 
-function connect() {
-  socket = new WebSocket(`ws://${location.host}/frames`);
-  socket.addEventListener('open', () => {
-    seen.connected = true;
-    unseen = 0;
-    document.body.classList.remove('lost');
-  });
-  socket.addEventListener('message', (event) => take(JSON.parse(event.data)));
-  socket.addEventListener('close', () => {
-    seen.connected = false;
-    document.body.classList.add('lost');
-    level(find('state'), 'error');
-    put(find('state'), '■ not connected: needle watch has ended or is not reachable');
-    setTimeout(connect, 1000);
-  });
-}
+const connection = new needleConnection.Connection(`ws://${location.host}/frames`, take, connected);
 
 /* The surfaces come once; null without an anatomy. */
 fetch('anatomy.json').then((answer) => answer.json()).then((content) => {
@@ -408,4 +453,3 @@ fetch('anatomy.json').then((answer) => answer.json()).then((content) => {
 });
 
 new ResizeObserver(() => frame && later()).observe(document.querySelector('main'));
-connect();
