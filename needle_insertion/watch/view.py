@@ -38,6 +38,9 @@ _POINTS: Final = 120
 _NODES: Final = 64
 
 
+#: Largest deflection of the tip to which a straight needle is drawn [m].
+_FAR: Final = 1.0
+
 _Place = Sequence[float | None]  #: Coordinates [m], None if unknown.
 
 
@@ -347,7 +350,7 @@ class View:
         length, free = tissue.get('length') or depth, tissue.get('free') or 0.0
         x, z = (one or 0.0 for one in guide)
         ends = [(x, min(depth - length, -free), z), (x, -free, z)]
-        if tip is not None and None not in (tip[0], tip[2]):
+        if tip is not None and all(one is not None and abs(one) <= _FAR for one in tip[::2]):
             x, _, z = tip  # type: ignore[assignment]
         ends.append((x, depth, z))
         return {'needle': line(np.array(ends)), 'path': path, 'shape': 'straight'}
@@ -381,6 +384,8 @@ class View:
         stamp, since = self._stamps[topic]
         if not self.robot.stamped(topic) or now - since <= self._silence:
             return ''
+        if not stamp:
+            return f'{topic} has no stamp'
         return f'{topic}: the stamp {stamp / NANOSECONDS:.3f} s does not advance'
 
     def _node_rows(self, now: float) -> list[dict[str, Any]]:

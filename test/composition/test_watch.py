@@ -131,6 +131,9 @@ def test_shape_is_simulated_or_straight_line() -> None:
     assert straight['shape'] == 'straight'
     # From the base through the guide, 4 cm before the skin, to the tip.
     assert straight['needle'] == [[1e-3, 1e-3, 3e-3], [-0.15, -0.04, 0.05], [0.0, 0.0, -1e-3]]
+    # A tip far away is not part of it.
+    view.reading('tip_deflection', numbers(-3.7e28, 0.05, -1e-3), 0.1)
+    assert view.frame(0.1)['needle'] == [[1e-3] * 3, [-0.15, -0.04, 0.05], [0.0] * 3]
     view.line('needle', shape(0.05), 0.5)
     view.line('path', shape(0.05)[20:], 0.5)
     bent = view.frame(0.6)

@@ -147,9 +147,13 @@ def test_constant_stamp_is_reported(stamps: str) -> None:
         view.reading('joint_states', state(['insertion'], 0.05, 0.0, 0.0), 0.1 * k)
         reason = view.frame(0.1 * k)['faults'].get('depth', '')
         assert bool(reason) == (k > 10 and stamps == 'header')
+    if stamps == 'header':
+        for time in (3.0, 4.1):
+            view.reading('joint_states', state(['insertion'], 0.05, 0, 0)._replace(stamp=0), time)
+        assert view.frame(4.1)['faults']['depth'] == 'joint_states has no stamp'
     assert reason in ('', f'joint_states: the stamp {EPOCH / 1e9:.3f} s does not advance')
-    view.reading('joint_states', state(['insertion'], 0.05, 0, 0)._replace(stamp=1), 3.0)
-    assert view.frame(3.0)['faults'] == {}
+    view.reading('joint_states', state(['insertion'], 0.05, 0, 0)._replace(stamp=1), 5.0)
+    assert view.frame(5.0)['faults'] == {}
 
 
 @pytest.mark.parametrize(('value', 'words'), [(nan, 'NaN received'), (inf, 'inf received')])

@@ -438,9 +438,10 @@ function connected() {
   tellState();
   tellControl();
   if (lost) {
-    const open = [...asked].map((what) => `${what}: no answer, it may have been executed; `).join('');
-    answered({asked: '', success: false, words: `${open}${connection.trouble()}`});
+    const words = [...asked].map((what) => `${what}: no answer, it may have been executed`);
     asked.clear();
+    level(find('answer'), 'error');
+    put(find('answer'), `■ ${[...words, connection.trouble()].join('; ')}`);
   }
   if (frame) QUANTITIES.forEach(show);
 }
