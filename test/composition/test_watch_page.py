@@ -70,6 +70,14 @@ async def test_any_reading_leaves_the_page_usable() -> None:
         assert found['slowest'] < 1000.0
         assert found['named']
         assert found['again'] == [60, 10]
+        # A range that is reserved for later frames stays.
+        reserved = (
+            '(() => { drawing.reserve({...frame, depth: 0.3}, scene); '
+            'for (let k = 0; k < 3; k += 1) '
+            '{ drawing.since -= 11000; drawing.draw(scene, {...frame, depth: null}); } '
+            'return drawing.end; })()'
+        )
+        assert await tab.run(reserved) == 320
         page.feed['joint_states'] = joints('insertion')
         await tab.wait("document.getElementById('far').hidden", 'the next reading')
         assert tab.faults == []
