@@ -3,7 +3,7 @@
 
 from collections.abc import Sequence
 from reprlib import repr as shortened
-from typing import Annotated, NamedTuple, TypeAlias
+from typing import Annotated, Final, NamedTuple, TypeAlias
 
 from needle_ros.errors import ParameterError, ShapeError
 import numpy as np
@@ -37,16 +37,24 @@ IntVector: TypeAlias = Annotated[IntArray, Shaped(np.int64, 1)]
 BoolVector: TypeAlias = Annotated[BoolArray, Shaped(np.bool_, 1)]
 
 
+_NO_NUMBERS: Final = 'cSUmM'  #: Kinds of arrays of complex numbers, text, dates and durations.
+
+
 def floats(name: str, values: object, shape: Sequence[int | None] | None = None) -> FloatArray:
     """
     Return a copy of finite numbers as an array, of a shape if it is given; None is any length.
 
-    Raises ShapeError for another shape and for text, and ParameterError for infinity and nan.
+    Raises ShapeError for another shape, text and complex numbers, and ParameterError for infinity
+    and nan.
     """
     try:
-        found = np.array(values, dtype=np.float64)
+        given = np.asarray(values)
+        if given.dtype.kind in _NO_NUMBERS:
+            raise TypeError
+        found = given.astype(np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise ShapeError(f'{name} must be numbers, got {shortened(values)}') from None
+        what = f'an array of {values.dtype}' if isinstance(values, np.ndarray) else None
+        raise ShapeError(f'{name} must be real numbers, got {what or shortened(values)}') from None
     if shape is not None and not _fits(found.shape, shape):
         lengths = ', '.join('n' if length is None else str(length) for length in shape)
         lengths += ',' * (len(shape) == 1)

@@ -26,6 +26,7 @@ from needle_dynamics.friction import Friction
 from needle_dynamics.modes import mode_shapes, ModeShapes
 from needle_dynamics.parameters import NeedleParameters, Tissue
 from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.settings import checked, is_whole
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -120,9 +121,9 @@ class NeedleModel:
 
     def checked_state(self, state: ArrayLike) -> FloatArray:
         """Return a copy of a state, or raise NeedleError."""
-        checked = floats('state', state, (2 * self.coordinates,))
+        found = floats('state', state, (2 * self.coordinates,))
         p = self.parameters
-        depth = p.length - checked[0]
+        depth = p.length - found[0]
         high = self.modes.reach * p.length
         # The insertion depth is a difference, so its limits hold up to rounding.
         if not p.minimum_depth - ROUNDING * p.length <= depth <= high:
@@ -130,7 +131,7 @@ class NeedleModel:
                 f'insertion depth {depth:.6g} m is outside [{p.minimum_depth:g}, {high:g}] m '
                 '(minimum_depth to the hub)'
             )
-        return checked
+        return found
 
     def _stiffness(self, at: ModeIntegrals, depth: float, time: float) -> FloatArray:
         tissue, layer = self.tissue, self.tissue.layer(depth)
@@ -146,10 +147,13 @@ class NeedleModel:
 
         With a tip deflection w(s), the shape is the static shape under a lateral force at the tip,
         which has the least elastic energy for that deflection. (The source gives only the tip
-        deflection.) ``modal``, q1 to qn [m^3/2], gives the shape instead.
+        deflection.) ``modal``, q1 to qn [m^3/2], gives the shape instead. The beam is linear:
+        valid up to a tip deflection of about a tenth of the insertion depth.
         """
+        longest = self.parameters.length
+        checked('tip_deflection', tip_deflection, 'm', low=-longest, high=longest)
         state = np.zeros(2 * self.coordinates)
-        state[0] = self.parameters.length - depth
+        state[0] = longest - depth
         state = self.checked_state(state)
         if len(modal):
             if len(modal) != self.modes.count:
@@ -183,7 +187,7 @@ class NeedleModel:
     def shape(self, state: ArrayLike, points: int = 50) -> FloatArray:
         """Return points y and w(y) [m] from entry point to tip, equation (10); (points, 2)."""
         x = self.checked_state(state)
-        if not isinstance(points, int) or points < 2:
+        if not is_whole(points) or points < 2:
             raise ShapeError(f'points must be an integer >= 2, got {points!r}')
         y = np.linspace(0.0, self.parameters.length - x[0], points)
         return np.column_stack([y, self.modes.values(y) @ x[2 : self.coordinates]])

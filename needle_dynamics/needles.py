@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from difflib import get_close_matches
 from math import pi
+from os import fspath, PathLike
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -131,7 +132,7 @@ NEEDLES: Final[Mapping[str, NeedlePreset]] = {
 }
 
 
-def find_needle(name: str) -> NeedlePreset:
+def find_needle(name: str | PathLike[str]) -> NeedlePreset:
     """
     Return a needle of `NEEDLES`, or of a YAML file.
 
@@ -140,7 +141,7 @@ def find_needle(name: str) -> NeedlePreset:
 
     Parameters
     ----------
-    name : str
+    name : str or path
         Key of `NEEDLES`, or file name (.yaml).
 
     Returns
@@ -154,6 +155,7 @@ def find_needle(name: str) -> NeedlePreset:
     0.04
 
     """
+    name = fspath(name) if isinstance(name, PathLike) else name
     if not isinstance(name, str) or (name not in NEEDLES and not name.endswith(FILES)):
         near = get_close_matches(str(name), NEEDLES, 1)
         meant = f'; did you mean {near[0]}?' if near else ''

@@ -183,6 +183,8 @@ class NeedleParameters:
     def _check_modes(self) -> None:
         n = self.modes
         check_whole('modes', n, 1, MOST_MODES)
+        # An integer of NumPy would cause it, too.
+        object.__setattr__(self, 'modes', int(n))
         least = LEAST_RATIOS[n - 1] * self.length
         if self.minimum_depth < least:
             raise ParameterError(

@@ -7,6 +7,7 @@ from dataclasses import Field, field, fields
 from difflib import get_close_matches
 from importlib import import_module
 from math import inf, isfinite
+from numbers import Integral, Real
 from pathlib import Path
 import sys
 from typing import Any, Final, TypeGuard, TypeVar
@@ -15,6 +16,9 @@ from needle_ros.errors import ParameterError
 from needle_ros.quantities import accepted_units, quantity
 
 _Settings = TypeVar('_Settings')
+
+#: Types of numbers, also of NumPy; the usual ones are found first.
+_NUMBERS: Final = (int, float, Real)
 
 _LISTS: Final = (list, array, type(None))  #: Types accepted for a tuple.
 
@@ -84,8 +88,11 @@ def check_constants(values: object) -> None:
         value, meta = getattr(values, item.name), item.metadata
         if 'unit' in meta:
             several = isinstance(item.default, tuple)
-            if not several or (_may_be_single(item) and isinstance(value, (int, float))):
+            if not several or (_may_be_single(item) and isinstance(value, _NUMBERS)):
                 _check_number(item.name, value, meta)
+                if not isinstance(value, (int, float)):
+                    plain = int(value) if isinstance(value, Integral) else float(value)
+                    object.__setattr__(values, item.name, plain)
                 continue
             listed = _listed(item.name, value)
             for number in listed:
@@ -157,18 +164,24 @@ def check_choice(name: str, value: object, valid: Collection[str]) -> None:
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Return whether a value is a finite integer or float; a Boolean is not a number."""
-    # Larger integers cannot be converted to float.
-    return (
-        isinstance(value, (int, float))
-        and not isinstance(value, bool)
-        and abs(value) <= sys.float_info.max
-    )
+    """Return whether a value is a finite real number, also of NumPy; a Boolean is not one."""
+    if isinstance(value, bool) or not isinstance(value, _NUMBERS):
+        return False
+    try:
+        return isfinite(value)
+    # An integer of too many digits.
+    except OverflowError:
+        return False
+
+
+def is_whole(value: object) -> TypeGuard[int]:
+    """Return whether a value is an integer, also of NumPy; a Boolean is not one."""
+    return isinstance(value, (int, Integral)) and not isinstance(value, bool)
 
 
 def check_whole(name: str, value: object, low: int, high: int) -> None:
     """Raise `ParameterError` if a value is not an integer in a range."""
-    if not (isinstance(value, int) and is_number(value) and low <= value <= high):
+    if not (is_whole(value) and low <= value <= high):
         raise ParameterError(f'{name} must be an integer from {low} to {high}, got {value!r}')
 
 
@@ -183,10 +196,11 @@ def checked(
     unlimited: bool = False,
 ) -> float:
     """Return a number as a float; raise `ParameterError` outside its range, as of `constant`."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    if isinstance(value, bool) or not isinstance(value, _NUMBERS):
         raise ParameterError(f'{name} must be a number, got {value!r}')
     if isinstance(value, int) and not is_number(value):
         raise ParameterError(f'{name} must be finite, got an integer of too many digits')
+    value = value if isinstance(value, (int, float)) else float(value)
     infinite = not isfinite(value) and not (unlimited and value == inf)
     if infinite or (value <= low if open_low else value < low) or value > high:
         lower = f'{">" if open_low else ">="} {low:g}' if isfinite(low) else ''
@@ -260,7 +274,7 @@ def _as_number(name: str, value: Any, unit: str) -> Any:
         except ParameterError as error:
             units = f', or text with a unit of {accepted_units(unit)}' if unit != '1' else ''
             raise ParameterError(f'{name} must be a number{units}, got {value!r}') from error
-    return float(value) if isinstance(value, int) and is_number(value) else value
+    return float(value) if is_number(value) else value
 
 
 def unknown_name(name: str, valid: Iterable[str]) -> str:

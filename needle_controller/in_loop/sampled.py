@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain, repeat
 from math import isfinite
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from needle_controller.compiled.loop import LaneLoop, run_lanes, run_loop
 from needle_controller.compiled.many_loop import run_many_lanes
@@ -31,10 +31,13 @@ from needle_dynamics.simulated.batch import (
     thread_count,
 )
 from needle_dynamics.simulated.integrator import DEFAULT_STEP
+from needle_dynamics.simulated.trajectory import count_of
 from needle_ros.errors import ParameterError, ShapeError
+from needle_ros.settings import check_whole, checked
 import numpy as np
 from numpy.typing import ArrayLike
 
+_LONGEST: Final = 1_000_000  #: largest delay of a controller [periods]
 _NONE: Final = np.empty((0, 3))  #: no additional friction
 
 
@@ -75,7 +78,7 @@ def run_controller(
     state : array_like, shape (2 (2 + n),)
         Initial state.
     duration : float
-        Time to simulate [s].
+        Time to simulate [s], a whole number of periods.
     step : float
         Longest step of the integrator [s].
     ground_truth : bool
@@ -92,7 +95,8 @@ def run_controller(
     InsertionDepthError
         If the needle leaves its range.
     ParameterError
-        If ``command`` returns something else than a `ControllerOutput`.
+        If period or delay of the controller or the duration is not valid, or ``command`` returns
+        something else than a `ControllerOutput`.
 
     Examples
     --------
@@ -107,12 +111,18 @@ def run_controller(
     True
 
     """
-    integrator, period = Integrator(plant, state, step), controller.period
-    model, count = integrator.model, round(duration / period)
+    name = type(controller).__name__
+    period = getattr(controller, 'period', None)
+    period = checked(f'{name}.period', period, 's', low=0.0, open_low=True)
+    delay: Any = getattr(controller, 'delay', None)
+    check_whole(f'{name}.delay', delay, 0, _LONGEST)
+    count = count_of(duration, period, 'period')
+    integrator = Integrator(plant, state, step)
+    model = integrator.model
     time = np.arange(count + 1, dtype=np.float64) * period
     states = np.empty((count + 1, 2 * model.coordinates))
     forces = np.zeros((count + 1, model.coordinates))
-    m, pending = model.coordinates, deque([(0.0, 0.0)] * controller.delay)
+    m, pending = model.coordinates, deque([(0.0, 0.0)] * delay)
     for k in range(count):
         states[k] = x = integrator.state
         measured = Measurement(
@@ -125,10 +135,7 @@ def run_controller(
         load = -float(model.bias_forces(x, measured.time)[0]) if ground_truth else 0.0
         command = controller.command(measured, load)
         if not isinstance(command, ControllerOutput):
-            raise ParameterError(
-                f'{type(controller).__name__}.command must return a ControllerOutput, got '
-                f'{command!r}'
-            )
+            raise ParameterError(f'{name}.command must return a ControllerOutput, got {command!r}')
         pending.append((float(command.force), float(command.torque)))
         applied = pending.popleft()
         forces[k, :2] = applied
@@ -204,7 +211,7 @@ def run_batch(
     limit : float
         Largest force [N].
     duration : float
-        Time to simulate [s].
+        Time to simulate [s], rounded to whole periods.
     late : int
         Additional periods of delay that the laws do not compensate.
     noise : array_like, shape (k, 3) or (0,)

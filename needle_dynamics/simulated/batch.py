@@ -24,7 +24,7 @@ from needle_dynamics.simulated.needle_array import columns_of, NeedleArray
 from needle_dynamics.simulated.trajectory import count_of, refined
 from needle_ros.errors import ParameterError, ShapeError
 from needle_ros.process import cores
-from needle_ros.settings import checked
+from needle_ros.settings import checked, is_whole
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike
@@ -199,9 +199,9 @@ def number_of_runs(**counts: int) -> int:
 
 def thread_count(workers: int | None, runs: int) -> int:
     """Return the number of threads of a batch; by default one per core."""
-    if workers is not None and (not isinstance(workers, int) or workers < 1):
+    if workers is not None and (not is_whole(workers) or workers < 1):
         raise ParameterError(f'workers must be an integer >= 1, got {workers!r}')
-    return min(workers or cores(), runs)
+    return min(int(workers or cores()), runs)
 
 
 def _take(

@@ -17,7 +17,7 @@ from needle_dynamics.model import NeedleModel
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.integrator import checked_step, not_completed, SHORTEST_STEP
 from needle_ros.errors import ParameterError
-from needle_ros.settings import checked
+from needle_ros.settings import checked, is_whole
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -176,7 +176,7 @@ def simulate(
     if (graded or order is not None) and step is None:
         raise ParameterError('graded and order require a step')
     order = ORDERS[0] if order is None else order
-    if not isinstance(order, int) or order not in ORDERS:
+    if not is_whole(order) or order not in ORDERS:
         raise ParameterError(f'order must be one of {", ".join(map(str, ORDERS))}, got {order!r}')
     if order > ORDERS[0] and parameters.friction_law != FRICTION_LAWS[COULOMB]:
         raise ParameterError(
@@ -188,11 +188,13 @@ def simulate(
     if interval is None:
         if callable(force):
             raise ParameterError('interval must be given with a force that is a function of time')
-        interval = duration / DEFAULT_SAMPLES
+        interval = checked('duration', duration, 's') / DEFAULT_SAMPLES
     count = count_of(duration, interval)
     time = np.arange(count + 1, dtype=np.float64) * interval
-    pushes = [force(t) for t in time[:-1]] if callable(force) else np.full(count, force)
-    forces = floats('force', pushes, (count,))
+    if callable(force):
+        forces = floats('force', [force(t) for t in time[:-1]], (count,))
+    else:
+        forces = np.full(count, floats('force', force, ()))
     model = NeedleModel(parameters)
     start = model.checked_state(state)
     if step is None:
@@ -271,22 +273,19 @@ def _difference(model: NeedleModel, one: FloatArray, two: FloatArray) -> float:
     )
 
 
-def count_of(duration: float, interval: float) -> int:
+def count_of(duration: float, interval: float, name: str = 'interval') -> int:
     """Return the number of intervals in a duration [s], which must be a whole number."""
-    if not 0.0 < interval <= duration < inf:
-        raise ParameterError(
-            f'interval and duration must be positive and finite with interval <= duration, got '
-            f'interval = {interval!r} s, duration = {duration!r} s'
-        )
+    interval = checked(name, interval, 's', low=0.0, open_low=True)
+    duration = checked('duration', duration, 's', low=interval)
     if duration / interval > _MOST_INTERVALS:
         raise ParameterError(
-            f'duration must be at most {_MOST_INTERVALS:g} intervals, got {duration!r} s and '
+            f'duration must be at most {_MOST_INTERVALS:g} {name}s, got {duration!r} s and '
             f'{interval!r} s'
         )
     count = round(duration / interval)
     # Tolerance for rounding of the quotient.
     if abs(count * interval - duration) > 1e-9 * duration:
         raise ParameterError(
-            f'duration must be a whole number of intervals, got {duration!r} s and {interval!r} s'
+            f'duration must be a whole number of {name}s, got {duration!r} s and {interval!r} s'
         )
     return count

@@ -24,7 +24,7 @@ def insert_batch(
     guides: ArrayLike = 0.0,
     tilts: ArrayLike = 0.0,
     rolls: ArrayLike = 0.0,
-    seeds: Sequence[int] = (0,),
+    seeds: ArrayLike = (0,),
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> FloatArray:
@@ -44,7 +44,7 @@ def insert_batch(
         the skin.
     rolls : array_like, shape (), (k,) or (runs, k)
         Roll of the base [rad].
-    seeds : sequence of int
+    seeds : array_like, shape (n,)
         Seed of the path noise, for all runs or for each.
     workers : int, optional
         Threads; one per core by default.
@@ -74,8 +74,9 @@ def insert_batch(
     poses = _poses(depths, guides, tilts, rolls)
     each = [needles] if isinstance(needles, NeedleParameters) else list(needles)
     beyond = [steering] if isinstance(steering, SteeringParameters) else list(steering)
+    drawn_from = np.atleast_1d(np.asarray(seeds)).tolist()
     runs = number_of_runs(
-        needles=len(each), steering=len(beyond), poses=len(poses), seeds=len(seeds)
+        needles=len(each), steering=len(beyond), poses=len(poses), seeds=len(drawn_from)
     )
     cell = noise_cell(beyond[0])
     if any(noise_cell(one) != cell for one in beyond):
@@ -95,8 +96,8 @@ def insert_batch(
     layers = np.full((len(pairs), 3, max(len(n.starts) for n in constants)), np.inf)
     for row, n in zip(layers, constants, strict=True):
         row[:, : len(n.starts)] = n.starts, n.stiffness, n.bevel
-    draws = range(max(len(pairs), len(seeds)) if any(s.path_noise for s in beyond) else 1)
-    drawn = [wandering(*pairs[i % len(pairs)], seeds[i % len(seeds)]) for i in draws]
+    draws = range(max(len(pairs), len(drawn_from)) if any(s.path_noise for s in beyond) else 1)
+    drawn = [wandering(*pairs[i % len(pairs)], drawn_from[i % len(drawn_from)]) for i in draws]
     wander = np.zeros((len(drawn), max(map(len, drawn)), 2))
     for row, loads in zip(wander, drawn, strict=True):
         row[: len(loads)] = loads

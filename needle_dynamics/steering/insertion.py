@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Insertion of a steered needle: dynamics along the axis, quasi-static lateral bending."""
 
-from collections.abc import Sequence
 from math import copysign, inf, isfinite
 from typing import Any
 
@@ -15,6 +14,7 @@ from needle_dynamics.steering.parameters import by_layer, SteeringParameters
 from needle_ros.errors import ParameterError
 from needle_ros.settings import checked
 import numpy as np
+from numpy.typing import ArrayLike
 
 DEFAULT_AXIS_STEP = 1e-4  #: default step along the axis [s]
 
@@ -137,10 +137,10 @@ class Insertion(Displayed):
         force: float,
         *,
         speed_limit: float = inf,
-        guide: Sequence[float] | None = None,
-        tilt: Sequence[float] | None = None,
+        guide: ArrayLike | None = None,
+        tilt: ArrayLike | None = None,
         roll: float | None = None,
-        tissue: Sequence[float] | None = None,
+        tissue: ArrayLike | None = None,
     ) -> float:
         """
         Advance for a duration [s] under a constant force; return the mean force of the base [N].
@@ -172,10 +172,10 @@ class Insertion(Displayed):
         velocity: float,
         *,
         forces: FloatArray | None = None,
-        guide: Sequence[float] | None = None,
-        tilt: Sequence[float] | None = None,
+        guide: ArrayLike | None = None,
+        tilt: ArrayLike | None = None,
         roll: float | None = None,
-        tissue: Sequence[float] | None = None,
+        tissue: ArrayLike | None = None,
     ) -> float:
         """
         Advance for a duration [s] with a linear change of the base velocity to ``velocity`` [m/s].

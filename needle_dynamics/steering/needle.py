@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Needle that cuts its path, moved by guide, roll and insertion depth."""
 
-from collections.abc import Sequence
 from math import ceil, exp, isfinite, sqrt
 from typing import Final, NamedTuple
 
@@ -34,7 +33,7 @@ from needle_dynamics.steering.parameters import (
     turning_load,
 )
 from needle_ros.errors import ParameterError
-from needle_ros.settings import checked
+from needle_ros.settings import checked, is_whole
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -97,7 +96,7 @@ def wandering(needle: NeedleParameters, steering: SteeringParameters, seed: int)
     """Draw the lateral tip loads in x and z [N] of the path noise, shape (cells, 2)."""
     # A load F turns the path of a long needle by F lambda / (E I) per length. Loads correlated
     # over a length turn it at random: the variance of its direction grows with its length.
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+    if not is_whole(seed) or seed < 0:
         raise ParameterError(f'seed must be an integer >= 0, got {seed!r}')
     if steering.path_noise == 0.0:
         return np.zeros((0, 2))
@@ -135,7 +134,8 @@ class SteeredNeedle(Displayed):
 
     The beam in each plane minimizes its energy: bending, tissue around the path, skin, and the
     lateral load of the bevel. While the tip moves beyond its greatest depth it cuts, and
-    the path ends at the tip. On withdrawal and reinsertion the needle follows this path.
+    the path ends at the tip. On withdrawal and reinsertion the needle follows this path. The beam
+    is linear: valid up to slopes of about 0.3, see ``shape.slopes``.
 
     Parameters
     ----------
@@ -143,9 +143,9 @@ class SteeredNeedle(Displayed):
         Needle and tissue.
     steering : SteeringParameters, optional
         Additional constants of a steered needle.
-    guide : sequence of float
+    guide : array_like, shape (2,)
         Position of the guide in x and z when the tip touches the skin [m].
-    tilt : sequence of float
+    tilt : array_like, shape (2,)
         Tilt of the guide (slope of the needle at the guide) in x and z.
     roll : float
         Roll of the needle, right-handed about y [rad]; at 0 the bevel pushes the tip along z.
@@ -173,8 +173,8 @@ class SteeredNeedle(Displayed):
         needle: NeedleParameters,
         steering: SteeringParameters | None = None,
         *,
-        guide: Sequence[float] = (0.0, 0.0),
-        tilt: Sequence[float] = (0.0, 0.0),
+        guide: ArrayLike = (0.0, 0.0),
+        tilt: ArrayLike = (0.0, 0.0),
         roll: float = 0.0,
         seed: int = 0,
     ) -> None:
@@ -213,8 +213,8 @@ class SteeredNeedle(Displayed):
         self,
         *,
         depth: float | None = None,
-        guide: Sequence[float] | None = None,
-        tilt: Sequence[float] | None = None,
+        guide: ArrayLike | None = None,
+        tilt: ArrayLike | None = None,
         roll: float | None = None,
         tissue: ArrayLike | None = None,
     ) -> None:
@@ -250,8 +250,8 @@ class SteeredNeedle(Displayed):
 
     def checked(
         self,
-        guide: Sequence[float] | None,
-        tilt: Sequence[float] | None,
+        guide: ArrayLike | None,
+        tilt: ArrayLike | None,
         roll: float | None,
         tissue: ArrayLike | None,
     ) -> Placement:
@@ -372,7 +372,7 @@ def inserted_shape(needle: SteeredNeedle, points: FloatArray) -> tuple[FloatArra
     return values, turns
 
 
-def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:
+def _pair(name: str, values: ArrayLike) -> tuple[float, float]:
     # The usual arguments, without the cost of arrays.
     if isinstance(values, (tuple, list)) and len(values) == 2:
         x, z = values

@@ -2,6 +2,7 @@
 """Control laws in the simulation: set-valued friction, sampled loops, and batches."""
 
 from dataclasses import replace
+import re
 from typing import Any
 
 from needle_controller import (
@@ -308,6 +309,33 @@ def test_law_that_returns_a_number_is_rejected() -> None:
 
     with pytest.raises(ParameterError, match=r'Number.command must return a ControllerOutput'):
         run_controller(Number(), MODEL.parameters, STRAIGHT, duration=0.01)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        ({'period': 0.0}, 'Proportional.period must be finite, > 0 s, got 0.0'),
+        ({'period': np.nan}, 'Proportional.period must be finite, > 0 s, got nan'),
+        ({'period': '1'}, "Proportional.period must be a number, got '1'"),
+        ({'delay': -1}, 'Proportional.delay must be an integer from 0 to 1000000, got -1'),
+        ({'delay': 0.5}, 'Proportional.delay must be an integer from 0 to 1000000, got 0.5'),
+        ({'delay': None}, 'Proportional.delay must be an integer from 0 to 1000000, got None'),
+        ({'duration': np.nan}, 'duration must be finite, >= 0.001 s, got nan'),
+        ({'duration': 0.5 * PERIOD}, 'duration must be finite, >= 0.001 s, got 0.0005'),
+        ({'duration': 2.5 * PERIOD}, 'duration must be a whole number of periods, got 0.0025'),
+    ],
+)
+def test_invalid_periods_delays_and_durations_are_rejected(
+    change: dict[str, Any], complaint: str
+) -> None:
+    """At the start, before a command."""
+    own = Proportional()
+    duration = change.pop('duration', 0.1)
+    for name, value in change.items():
+        setattr(own, name, value)
+    with pytest.raises(ParameterError, match=f'^{re.escape(complaint)}'):
+        run_controller(own, NOMINAL, START, duration=duration)
+    assert not own.seen
 
 
 def test_batch_noise_is_encoder_noise() -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from math import inf, isfinite
+import re
 from typing import Any
 
 from needle_dynamics import (
@@ -16,6 +17,7 @@ from needle_dynamics import (
     simulate,
     Trajectory,
 )
+from needle_ros.errors import NeedleError
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
@@ -284,3 +286,45 @@ def test_tolerance_is_met_through_rest_and_impact() -> None:
 def test_tolerance_must_be_positive_and_finite(tolerance: float) -> None:
     with pytest.raises(ParameterError, match='tolerance must be finite, > 0, got'):
         run(tolerance=tolerance)
+
+
+# --- invalid inputs -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ('change', 'complaint'),
+    [
+        ({'force': '3'}, "force must be real numbers, got '3'"),
+        ({'force': np.ones(3)}, 'force must have shape (), got (3,)'),
+        ({'force': 3j}, 'force must be real numbers, got 3j'),
+        ({'force': inf}, 'force must be finite, got inf'),
+        ({'force': lambda _: '3'}, 'force must be real numbers, got ['),
+        ({'state': 1j * np.ones(8)}, 'state must be real numbers, got an array of complex128'),
+        ({'state': np.array(['0.15'] * 8)}, 'state must be real numbers, got an array of <U4'),
+        ({'state': ['0.15'] * 8}, "state must be real numbers, got ['0.15', "),
+        ({'duration': '1'}, "duration must be a number, got '1'"),
+        ({'duration': inf}, 'duration must be finite'),
+        ({'interval': 0.3}, 'duration must be a whole number of intervals'),
+        ({'interval': 2.0}, 'duration must be finite, >= 2 s, got 1.0'),
+    ],
+)
+def test_invalid_inputs_of_a_run_are_named(change: dict[str, Any], complaint: str) -> None:
+    p = preset('phantom')
+    given: dict[str, Any] = {
+        'state': NeedleModel(p).state_at(0.05),
+        'force': PUSH,
+        'interval': 0.1,
+    } | change
+    given = {'duration': 1.0, **given}
+    with pytest.raises(NeedleError, match=f'^{re.escape(complaint)}'):
+        simulate(p, **given)
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    p = preset('phantom', modes=np.int64(2), length=np.float32(0.25))
+    assert type(p.modes) is int
+    start = NeedleModel(p).state_at(np.float32(0.0625))  # type: ignore[arg-type]
+    times: dict[str, Any] = {'duration': np.float32(0.5), 'interval': np.float32(0.125)}
+    found = simulate(p, start, np.float32(2.0), **times)  # type: ignore[arg-type]
+    same = simulate(p, start, 2, duration=0.5, interval=0.125)
+    assert np.array_equal(found.states, same.states)

@@ -40,6 +40,7 @@ def test_file_changes_constants_of_a_needle(tmp_path: Path) -> None:
     assert found.needle.tissue_stiffness == base.needle.tissue_stiffness
     assert found.source == str(file)
     assert NeedleParameters.preset(str(file)) == found.needle
+    assert find_needle(file) == found
 
 
 def test_diameters_stand_for_area_and_area_moment(tmp_path: Path) -> None:

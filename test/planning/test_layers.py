@@ -152,7 +152,7 @@ def test_plan_has_the_layers_and_its_insertions_sample_them(tmp_path: Path) -> N
         ('[[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]', 'increasing depths'),
         ('[[0.0, 0.0, 0.0]]', 'a stiffness > 0'),
         ('[[0.0, 1.0]]', r'must have shape \(n, 3\), got \(1, 2\)'),
-        ('soft', 'must be numbers'),
+        ('soft', 'must be real numbers'),
     ],
 )
 def test_damaged_layers_are_rejected(layers: str, message: str, tmp_path: Path) -> None:

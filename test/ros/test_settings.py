@@ -5,18 +5,23 @@ from __future__ import annotations
 
 from array import array
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import Any
 
 from needle_ros.errors import ParameterError
 from needle_ros.settings import (
     check_constants,
+    check_whole,
+    checked,
     choice,
     constant,
     flag,
     from_values,
+    is_number,
     text,
     unknown_name,
 )
+import numpy as np
 import pytest
 
 
@@ -57,6 +62,48 @@ class Pair:
         check_constants(self)
         if self.low > self.high:
             raise ParameterError('both are wrong: low > high')
+
+
+@pytest.mark.parametrize(
+    ('given', 'value'),
+    [
+        (np.int64(3), 3.0),
+        (np.uint8(3), 3.0),
+        (np.float32(0.1), float(np.float32(0.1))),
+        (np.float64(0.1), 0.1),
+        (Fraction(1, 4), 0.25),
+    ],
+)
+def test_numbers_of_numpy_are_numbers(given: Any, value: float) -> None:
+    """With the same result as numbers of Python, in every check."""
+    assert is_number(given)
+    assert checked('x', given) == value
+    for robot in (Robot(gain=given), from_values(Robot, {'gain': given, 'levels': [given]})):
+        assert isinstance(robot.gain, (int, float))
+        assert robot.gain == value
+    with pytest.raises(ParameterError, match=r'gain must be finite, > 0 and <= 50 1/s'):
+        Robot(gain=type(given)(200))
+    if value == 3.0:
+        check_whole('x', given, 0, 3)
+        with pytest.raises(ParameterError, match='x must be an integer from 0 to 2'):
+            check_whole('x', given, 0, 2)
+
+
+@pytest.mark.parametrize('given', [True, np.True_, '3', None, 3j, np.array(3.0), [3.0]])
+def test_other_types_are_no_numbers(given: Any) -> None:
+    assert not is_number(given)
+    with pytest.raises(ParameterError, match='x must be a number'):
+        checked('x', given)
+    for value in (given, np.float32(3.0), 3.0):
+        with pytest.raises(ParameterError, match='x must be an integer'):
+            check_whole('x', value, 0, 3)
+
+
+@pytest.mark.parametrize('given', [np.float32('nan'), np.float32('inf'), 10**400, np.nan])
+def test_numbers_that_are_not_finite_are_rejected(given: Any) -> None:
+    assert not is_number(given)
+    with pytest.raises(ParameterError, match='x must be finite'):
+        checked('x', given)
 
 
 def test_values_are_converted_to_field_types() -> None:

@@ -109,6 +109,20 @@ def test_wrong_shapes_are_rejected(shape: tuple[int, ...]) -> None:
             insert_batch(NEEDLE, STEERING, depths, rolls=rolls)
 
 
+@pytest.mark.parametrize('kind', [list, tuple, np.array, np.int64, range])
+def test_seeds_are_arrays_or_sequences(kind: Any) -> None:
+    noisy = SteeringParameters(path_noise=1e-3)
+    seeds = range(2, 4) if kind is range else kind([2, 3])
+    found = insert_batch(NEEDLE, noisy, [0.0, 0.1], seeds=seeds)
+    assert np.array_equal(found, insert_batch(NEEDLE, noisy, [0.0, 0.1], seeds=(2, 3)))
+    one = SteeredNeedle(NEEDLE, noisy, seed=np.int64(3))  # type: ignore[arg-type]
+    same = SteeredNeedle(NEEDLE, noisy, seed=3)
+    for needle, guide in ((one, np.array([1e-3, 0.0])), (same, (1e-3, 0.0))):
+        needle.move(guide=guide, tilt=0.0 * np.array(guide))
+        needle.move(depth=0.1)
+    assert np.array_equal(one.tip, same.tip)
+
+
 @pytest.mark.parametrize(
     ('change', 'error', 'words'),
     [
@@ -119,6 +133,7 @@ def test_wrong_shapes_are_rejected(shape: tuple[int, ...]) -> None:
         ({'depths': [0.0, np.nan]}, ParameterError, 'depths must be finite'),
         ({'rolls': [0.0, 1.0, 2.0]}, ShapeError, r'rolls must have shape \(2,\) or \(runs, 2\)'),
         ({'guides': [0.0, np.inf]}, ParameterError, 'guides must be finite'),
+        ({'seeds': [0.5]}, ParameterError, r'seed must be an integer >= 0, got 0\.5'),
         ({'seeds': ()}, ShapeError, 'got 1 needles, 1 steering, 1 poses, 0 seeds'),
         (
             {'seeds': (1, 2), 'needles': [NEEDLE] * 3},
