@@ -22,7 +22,6 @@ from needle_ros.files import read_yaml
 from needle_ros.process import cores
 from needle_ros.process_pool import processes
 from needle_ros.settings import check_whole, checked
-from needle_study.distribution import from_table
 from needle_study.scenario import check_names, mapping
 from needle_study.study import build_study, Study
 from needle_study.summary import column, Estimate, indices, NOISE, probability
@@ -423,19 +422,16 @@ def read_population(path: Path | str) -> tuple[dict[str, Any], list[Any]]:
         given = mapping('population', document.get('population'))
         if not given:
             raise ParameterError('population must have a variable')
-        found = {
-            str(name): from_table(f'population: {name}', one, path.parent)
-            for name, one in given.items()
-        }
         correlations = document.get('correlations') or []
         if not isinstance(correlations, list):
             raise ParameterError(f'correlations must be a list, got {correlations!r}')
         # The scenario reads its folder later.
         settings = {'folder': '', 'radius': 1.0}
-        build_study(
-            {'scenario': _SCENARIO, 'settings': settings, 'population': found,
-             'correlations': correlations}
+        study = build_study(
+            {'scenario': _SCENARIO, 'settings': settings, 'population': given,
+             'correlations': correlations},
+            path.parent,
         )  # fmt: skip
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
-    return found, correlations
+    return dict(study.document['population']), correlations

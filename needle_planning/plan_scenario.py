@@ -213,7 +213,7 @@ class PlanScenario(Scenario):
         self._plan: Plan | None = None  # without one, that of the folder
         self._source, self._images, self._labels = self._sources(settings)
         self._law = str(settings.get('law', DEFAULT_LAW))
-        find_law(self._law)
+        self.files = {**self.files, **scenario.class_files(self._law, find_law(self._law))}
         prior = scenario.mapping('settings: prior', settings.get('prior'))
         self._prior = from_values(SteeringPrior, prior, 'settings.prior.')
         contact = scenario.mapping('settings: contact', settings.get('contact'))

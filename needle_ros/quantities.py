@@ -46,9 +46,14 @@ NORMAL: Final = 1.96  #: Half width of a 95 % interval of a normal quantity [sta
 DEVIATION_OVER_MEDIAN: Final = 1.4826
 
 
+def factors(unit: str) -> Mapping[str, float]:
+    """Return the accepted units of a quantity with their factors to its SI unit."""
+    return _KINDS[unit][2] if unit in _KINDS else {unit: 1.0}
+
+
 def accepted_units(unit: str) -> str:
     """Return the units of text for a quantity in an SI unit, separated by commas."""
-    return ', '.join(_KINDS[unit][2] if unit in _KINDS else [unit])
+    return ', '.join(factors(unit))
 
 
 def quantity(text: str, unit: str) -> float:

@@ -12,6 +12,7 @@ from reprlib import repr as short
 from typing import Any, Final, NamedTuple
 
 from needle_dynamics import FloatArray
+from needle_ros.column_units import factor_of
 from needle_ros.errors import ParameterError
 from needle_ros.quantities import quantity
 from needle_ros.settings import find_class, is_number
@@ -184,8 +185,8 @@ def _kinds() -> str:
     return ', '.join([*kinds, *others, '{module:Class: [numbers]}'])
 
 
-def from_table(name: str, given: Any, folder: Path) -> Any:
-    """Return a distribution of a file with the rows of its table, if it names one."""
+def from_table(name: str, given: Any, folder: Path, unit: str) -> Any:
+    """Return a distribution of a file with the rows of its table, in SI units, if it names one."""
     if not (isinstance(given, Mapping) and TABLE in given):
         return given
     where = given[TABLE]
@@ -199,7 +200,12 @@ def from_table(name: str, given: Any, folder: Path) -> Any:
             rows = [row for row in csv.reader(stream) if row]
     except (OSError, ValueError, csv.Error) as error:
         raise ParameterError(f'{name}: {file} cannot be read: {error}') from error
-    return {_ROWS: _column(f'{name}: {file}', rows, column), _OF: file}
+    found = _column(f'{name}: {file}', rows, column)
+    try:
+        factor = factor_of(column, unit)
+    except ParameterError as error:
+        raise ParameterError(f'{name}: {file}: {error}') from error
+    return {_ROWS: [factor * value for value in found], _OF: file}
 
 
 def _column(where: str, rows: Sequence[Sequence[str]], column: str) -> list[float]:

@@ -27,6 +27,7 @@ from needle_dynamics import FloatArray
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.files import write_whole
 from needle_study.study import build_study, Study
+import numpy as np
 import pyarrow as pa
 from pyarrow import parquet
 
@@ -52,8 +53,13 @@ STUDY: Final = 'study.json'
 def order(study: Study) -> str:
     """Return the input of a worker as JSON: the study, and the versions of the packages."""
     return json.dumps(
-        {'study': study.document, 'versions': _versions()}, sort_keys=True, default=str
+        {'study': study.document, 'versions': _versions()}, sort_keys=True, default=_plain
     )
+
+
+def _plain(value: Any) -> Any:
+    """Return a number of NumPy as one of Python, and a path as text."""
+    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def _versions() -> dict[str, str]:
@@ -194,7 +200,10 @@ class Results:
     def add(self, first: int, columns: Mapping[str, FloatArray]) -> int:
         """Write a chunk that starts at the sample `first`; return its number of samples."""
         count = len(columns['sample'])
-        end, table, file = first + count, pa.table(dict(columns)), pa.BufferOutputStream()
+        end, file = first + count, pa.BufferOutputStream()
+        units = self.study.units
+        fields = [pa.field(name, pa.float64(), metadata={'unit': units[name]}) for name in columns]
+        table = pa.table(dict(columns), pa.schema(fields))
         # Not compressed: a part is removed when all are complete.
         with pa.ipc.new_file(file, table.schema) as writer:
             writer.write_table(table)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import inf, nan
 from numbers import Real
 from pathlib import Path
+import sys
 from typing import Any, Final, NamedTuple, TypeAlias
 from zlib import crc32
 
@@ -15,6 +16,12 @@ from needle_ros.contract import Topic
 from needle_ros.errors import ParameterError
 from needle_ros.settings import unknown_name
 import numpy as np
+
+#: Modules whose versions are in the identity of a study.
+_VERSIONED: Final = {
+    'needle_controller', 'needle_dynamics', 'needle_planning', 'needle_ros', 'needle_study',
+    'numpy', 'scipy', *sys.stdlib_module_names,
+}  # fmt: skip
 
 Row: TypeAlias = Mapping[str, float]  #: value of each variable of a sample
 Streams: TypeAlias = Sequence[np.random.Generator]  #: random numbers of each sample
@@ -64,27 +71,39 @@ class Scenario(ABC):
             self.row({name: float(values[k]) for name, values in samples.items()})
             for k in range(len(streams))
         ]
-        found = list[Mapping[str, float]]()
+        found = list[dict[str, float]]()
         for k in range(0, len(rows), self.at_once):
             part = slice(k, k + self.at_once)
             # A function without yield returns None.
-            some = list(self.insert(rows[part], streams[part]) or ())
-            count, valid = len(rows[part]), all(isinstance(one, Mapping) for one in some)
-            if len(some) != count or not valid:
+            some = [*map(self._checked, self.insert(rows[part], streams[part]) or ())]
+            if len(some) != len(rows[part]):
                 raise ParameterError(
-                    f'{type(self).__name__}.insert must yield the metrics of each of {count} '
-                    f'samples by name, got {len(some)}: {some[:1]}'
+                    f'{type(self).__name__}.insert must yield the metrics of each of '
+                    f'{len(rows[part])} samples by name, got {len(some)}'
                 )
             found += some
-        return {name: np.array([self._value(name, one) for one in found]) for name in self.metrics}
+        return {name: np.array([one.get(name, nan) for one in found]) for name in self.metrics}
 
-    def _value(self, name: str, found: Mapping[str, float]) -> float:
-        value = found.get(name, nan)
-        if not isinstance(value, (Real, np.bool_)):
+    def _checked(self, found: object) -> dict[str, float]:
+        """Return the metrics of a sample as numbers, as soon as it is simulated."""
+        where = f'{type(self).__name__}.insert'
+        if not isinstance(found, Mapping):
             raise ParameterError(
-                f'{type(self).__name__}.insert: the metric {name} must be a number, got {value!r}'
+                f'{where} must yield the metrics of a sample by name, got {found!r}'
             )
-        return float(value)
+        where = f'{where}: the metric'
+        for name, value in found.items():
+            if name not in self.metrics:
+                raise ParameterError(
+                    f'{where} {name!r} is not one of metrics: {", ".join(self.metrics)}'
+                )
+            if not isinstance(value, (Real, np.bool_)) or abs(value) == inf:
+                raise ParameterError(
+                    f'{where} {name} must be a finite number, or NaN, got {value!r}'
+                )
+            if not self.metrics[name].unit and value not in (0, 1) and value == value:
+                raise ParameterError(f'{where} {name} is yes or no: 1, 0 or NaN, got {value!r}')
+        return {name: float(value) for name, value in found.items()}
 
     def row(self, sample: Row) -> dict[str, float]:
         """Return the value of each variable, by default its default."""
@@ -128,8 +147,30 @@ def checksum(name: str, paths: Iterable[Path] = ()) -> str:
 
 def needle_files(needle: Any) -> dict[str, str]:
     """Return the checksum of the file of a needle by its name, nothing for a known needle."""
+    needle = str(needle) if isinstance(needle, Path) else needle
     is_file = isinstance(needle, str) and needle not in NEEDLES and needle.endswith(FILES)
     return {needle: checksum(needle)} if is_file else {}
+
+
+def class_files(address: str, found: Any) -> dict[str, str]:
+    """
+    Return the checksum of the source files of a class by its address ``module:Class``.
+
+    These are the files of its module and of its base classes, without those of this package,
+    NumPy and SciPy: nothing for a class of these.
+    """
+    if ':' not in address:
+        return {}
+    bases = found.__mro__ if isinstance(found, type) else type(found).__mro__
+    names = dict.fromkeys((address.partition(':')[0], *(one.__module__ for one in bases)))
+    files = {
+        Path(file)
+        for name in names
+        if name.partition('.')[0] not in _VERSIONED
+        and (file := getattr(sys.modules.get(name), '__file__', None))
+    }
+    # In the order of the names: folders of workers differ.
+    return {address: checksum(address, sorted(files, key=lambda one: one.name))} if files else {}
 
 
 def mapping(name: str, value: Any) -> Mapping[str, Any]:

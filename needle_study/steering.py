@@ -101,7 +101,7 @@ class SteeringScenario(Scenario):
         nominal = find_needle(needle)
         self.files = scenario.needle_files(needle)
         self._law = str(settings.get('law', DEFAULT_LAW))
-        find_law(self._law)
+        self.files |= scenario.class_files(self._law, find_law(self._law))
         constants = scenario.mapping('settings: constants', settings.get('constants'))
         try:
             self._needle, self._steering, _ = nominal.changed(constants)
@@ -126,11 +126,13 @@ class SteeringScenario(Scenario):
                 f'settings: law {self._law} with guide_limit {numbers.guide_limit:g} and turns '
                 f'{numbers.turns:g} has no actuation'
             )
-        bevel = max(self._steering.bevel_load)
+        bevel, length = max(self._steering.bevel_load), self._needle.length
         noise = self._prior.path_noise
         self.variables: Mapping[str, Variable] = {
-            'target_x': Variable(0.0, 'm', 'lateral position of the target'),
-            'target_z': Variable(0.0, 'm', 'lateral position of the target'),
+            **dict.fromkeys(
+                ('target_x', 'target_z'),
+                Variable(0.0, 'm', 'lateral position of the target', -length, length),
+            ),
             'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
             'skin': Variable(
                 1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3

@@ -16,7 +16,7 @@ from needle_ros.files import read_yaml
 from needle_ros.settings import check_choice, check_whole, find_class, is_number, LARGEST_SEED
 from needle_study.designs import BELOW, DESIGNS, INSIDE, RandomDesign, SobolDesign
 from needle_study.distribution import Distribution, distribution, from_table
-from needle_study.scenario import check_names, mapping, Scenario, SCENARIOS
+from needle_study.scenario import check_names, class_files, mapping, Scenario, SCENARIOS
 import numpy as np
 
 if TYPE_CHECKING:
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 #: Keys of a study file.
 _KEYS: Final = ('scenario', 'samples', 'seed', 'design', 'settings', 'population', 'correlations')
 _FILES: Final = 'files'  #: key of the checksums of the files that the scenario reads
+
+#: Metrics of samples that may have no other metric.
+FAILURES: Final = ('refused', 'stopped')
 
 _PARTS: Final = 50  #: largest number of parts of a study that shows its progress
 _MOST: Final = 2**30  #: largest number of samples, as limited by the Sobol sequence
@@ -50,6 +53,13 @@ class Study:
     @property
     def samples(self) -> int:
         return self.design.samples
+
+    @property
+    def units(self) -> dict[str, str]:
+        """SI unit of each column, '1' for numbers and for yes or no."""
+        parts = self.scenario.variables, self.scenario.metrics
+        known = {name: one.unit or '1' for part in parts for name, one in part.items()}
+        return {'sample': '1', **known}
 
     def simulate(self, progress: Progress | None = None) -> StudyTable:
         """Simulate all samples in this process; `needle study` uses all cores, and files."""
@@ -81,18 +91,26 @@ class StudyTable(Displayed):
     values: Mapping[str, FloatArray]  #: by name, each of shape (n,); 1 for yes, NaN if missing
 
     def __repr__(self) -> str:
-        parts = [f'{len(self.values["sample"])} samples']
+        samples = len(self.values['sample'])
+        parts = [f'{samples} samples']
         for name, one in list(self.study.scenario.metrics.items())[:2]:
             known = self.values[name][np.isfinite(self.values[name])]
+            if not len(known):
+                parts.append(f'no value of {name}')
+                continue
             median = f'median {name} {np.median(known):.4g} {one.unit}'.removesuffix(' 1')
-            parts += [median if one.unit else f'{name} {known.mean():.1%}'] * bool(len(known))
+            of = f' of {len(known)} samples' * (len(known) < samples)
+            parts.append(f'{median}{of}' if one.unit else f'{name} {known.mean():.1%}')
+        parts += [
+            f'{count} {name}'
+            for name in FAILURES
+            if (count := int(np.nansum(self.values.get(name, np.zeros(1)))))
+        ]
         return f'<StudyTable: {", ".join(parts)}>'
 
     def columns(self) -> dict[str, FloatArray]:
-        scenario = self.study.scenario
-        units = {name: one.unit for name, one in scenario.variables.items()}
-        units |= {name: one.unit for name, one in scenario.metrics.items()}
-        return {f'{name} [{units.get(name) or 1}]': one for name, one in self.values.items()}
+        units = self.study.units
+        return {f'{name} [{units[name]}]': one for name, one in self.values.items()}
 
     def plot(self, figure: Figure | None = None) -> list[Axes]:
         """Draw the distribution of the primary metric, and the metric over each variable."""
@@ -132,19 +150,14 @@ def read_study(path: Path | str) -> Study:
     path = Path(path)
     document = read_yaml(path)
     try:
-        if isinstance(document, dict) and isinstance(given := document.get('population'), dict):
-            document['population'] = {
-                name: from_table(f'population: {name}', one, path.parent)
-                for name, one in given.items()
-            }
-        study = build_study(document)
+        study = build_study(document, path.parent)
         study.scenario.check()
         return study
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
 
 
-def build_study(document: Any) -> Study:
+def build_study(document: Any, folder: Path | str = '') -> Study:
     """
     Build a study from the content of a study file.
 
@@ -152,6 +165,8 @@ def build_study(document: Any) -> Study:
     ----------
     document : mapping
         Keys and values of the file, in SI units or as text with a unit.
+    folder : Path or str
+        Folder of its tables, by default the current folder.
 
     Raises
     ------
@@ -176,6 +191,10 @@ def build_study(document: Any) -> Study:
         if name in scenario.absent:
             raise ParameterError(f'population: {name} {scenario.absent[name]}')
     check_names('population: ', given, known)
+    given = {
+        name: from_table(f'population: {name}', one, Path(folder), known[name].unit)
+        for name, one in given.items()
+    }
     # The dimension of a variable must not depend on its order in the file: workers sort it.
     population = {
         name: distribution(f'population: {name}', given[name], known[name].unit)
@@ -190,11 +209,17 @@ def build_study(document: Any) -> Study:
                 f'population: {name} must be finite and in [{low:g}, {high:g}] {unit}, and would '
                 f'be from {least:g} to {most:g}; truncate it with within: [low, high]'
             )
+    of_own = class_files(document['scenario'], of_class)
+    for one in population.values():
+        if ':' in one.kind:
+            of_own |= class_files(one.kind, find_class('a distribution', one.kind, {}))
     factor = _factor(document.get('correlations', []), dimensions(population))
-    begun, files = mapping(_FILES, document.get(_FILES)), dict(scenario.files)
+    begun, files = mapping(_FILES, document.get(_FILES)), {**of_own, **scenario.files}
     if changed := [name for name, checksum in begun.items() if files.get(name) != checksum]:
         raise ParameterError(f'{changed[0]} is not the file with which the study was begun')
-    content = {**document, _FILES: files} if files else dict(document)
+    # The workers have no tables.
+    content = {**document, 'population': given} if given else dict(document)
+    content |= {_FILES: files} if files else {}
     return Study(scenario, DESIGNS[design](samples, seed, factor), population, content)
 
 

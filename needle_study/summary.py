@@ -33,6 +33,8 @@ _TAIL: Final = 0.025  #: probability of an interval above the true value, and be
 #: Groups of samples in the estimate of a variance fraction, and the least number of samples.
 _GROUPS, _FEWEST = 32, 200
 
+_ENOUGH: Final = 2.0  #: least number of samples of a replicate on each side of a quantile
+
 #: Name of the noise among the variables.
 NOISE: Final = 'noise'
 
@@ -142,6 +144,10 @@ def quantile(values: FloatArray, part: float, design: RandomDesign | None = None
     """
     Estimate a quantile, with an interval by ranks.
 
+    With replicates that have enough samples, the interval has the values for which the fractions
+    of the replicates below do not deviate from ``part``, by their scatter and Student's
+    distribution: the fractions have no bias, unlike the quantiles of few samples.
+
     Parameters
     ----------
     values : array, shape (n,)
@@ -159,6 +165,11 @@ def quantile(values: FloatArray, part: float, design: RandomDesign | None = None
     value = float(np.quantile(finite, part))
     size = n
     if design and design.replicates:
+        of = design.replicate(known[np.argsort(values[known], kind='stable')])
+        numbers = np.bincount(of, minlength=design.replicates)
+        if numbers.min() * min(part, 1.0 - part) >= _ENOUGH:
+            low, high = _ranks(of, numbers, part)
+            return Estimate(value, float(finite[low - 1]), float(finite[high]), n)
         below = (values[known] <= value).astype(np.float64)
         size = max(1, round(_size(_sums(below, known, design, design.replicates))))
     # Ranks, from 1: the true value is below the first, and above the second, in one of 40 studies
@@ -171,6 +182,29 @@ def quantile(values: FloatArray, part: float, design: RandomDesign | None = None
         float(finite[high]) if high < n else np.inf,
         n,
     )
+
+
+def _ranks(of: IntArray, numbers: IntArray, part: float) -> tuple[int, int]:
+    """
+    Return the ranks of the ends of an interval, below and above it.
+
+    ``of`` has the replicate of each value in rising order, ``numbers`` the values of each.
+    """
+    n, count = len(of), len(numbers)
+    # Number of smaller values of the same replicate.
+    smaller, order = np.empty(n), np.argsort(of, kind='stable')
+    smaller[order] = np.arange(n) - np.repeat(np.cumsum(numbers) - numbers, numbers)
+    each = 1.0 / numbers[of]
+    # Of the fractions of the replicates below a value: mean, mean square and variance of the mean.
+    mean = np.cumsum(each) / count
+    square = np.cumsum((2.0 * smaller + 1.0) * each**2) / count
+    variance = np.maximum(square - mean**2, 0.0) / (count - 1)
+    most = float(stdtrit(count - 1, 1.0 - _TAIL)) * np.sqrt(variance)
+    inside = 1 + np.flatnonzero(np.abs(mean - part) <= most)
+    # Without scatter, as of the median of one variable, the ends are next to the estimate.
+    middle = np.array([int(n * part), int(n * part) + 1])
+    inside = np.concatenate([inside[inside < n], middle])
+    return int(inside.min()), int(inside.max())
 
 
 def indices(

@@ -37,7 +37,7 @@ from needle_identification.friction.punctures import find_punctures
 from needle_identification.friction.settings import AUTO, FrictionSettings
 from needle_identification.friction.steady import misfit_at_speeds
 from needle_identification.recordings.recording import Recording
-from needle_identification.recordings.units import UNITS
+from needle_ros.column_units import UNITS
 import numpy as np
 
 _HIDDEN: Final = 0.2  # largest velocity noise threshold, as a fraction of the median speed

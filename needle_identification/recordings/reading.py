@@ -16,8 +16,8 @@ from needle_identification.recordings import friction_table, samples, tables, TI
 from needle_identification.recordings.likeness import oblique
 from needle_identification.recordings.merging import merge, merged_recording
 from needle_identification.recordings.recording import IndentationRecording, Recording
-from needle_identification.recordings.units import foreign_unit, UNITS
 from needle_ros import wire
+from needle_ros.column_units import foreign_unit, UNITS
 from needle_ros.contract import (
     BASE_WRENCH,
     END_EFFECTOR_POSE,

@@ -27,7 +27,7 @@ from needle_identification.bags.bag import MATLAB, TABLES
 from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.samples import are_gaps, Series
-from needle_identification.recordings.units import (
+from needle_ros.column_units import (
     BRACKETS,
     foreign_unit,
     ONLY_IN_BRACKETS,

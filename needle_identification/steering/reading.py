@@ -28,7 +28,6 @@ from needle_identification.recordings import reading, tables
 from needle_identification.recordings.merging import merge
 from needle_identification.recordings.samples import EachJoint, source_of
 from needle_identification.recordings.tables import Table
-from needle_identification.recordings.units import states_unit, unit_of, UNITS
 from needle_identification.sensor.checks import zero_rows
 from needle_identification.steering.recording import (
     DEEPEST,
@@ -37,6 +36,7 @@ from needle_identification.steering.recording import (
     SteeringRecording,
 )
 from needle_ros import contract, wire
+from needle_ros.column_units import states_unit, unit_of, UNITS
 from needle_ros.quantities import signed, signed_axis
 import numpy as np
 

@@ -13,7 +13,7 @@ from needle_insertion.report.page import write_page
 from needle_study import summary
 from needle_study.engine import Results
 from needle_study.scenario import Metric
-from needle_study.study import Study
+from needle_study.study import FAILURES, Study
 import numpy as np
 from scipy.stats import binned_statistic_2d
 import yaml
@@ -82,8 +82,14 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
         median = summary.quantile(values, 0.5, study.design)
         headline.append((f'Median {main}', median, units[main]))
         pictures.append(_distribution(main, metrics[main], values))
-    refused = probabilities.get('refused')
-    cards += [_card(*one, refused) for one in headline]
+    counts = {
+        name: int(np.nansum(summary.column(table, name, _MOST)))
+        for name in FAILURES
+        if name in metrics
+    }
+    failed = ', '.join(f'{count} {name}' for name, count in counts.items() if count)
+    # Probabilities are of all samples.
+    cards += [_card(*one, len(values) if one[2] != '%' else 0, failed) for one in headline]
     if drawn:
         pictures += _map(main, metrics[main], values, most, study)
     write_page(
@@ -123,15 +129,17 @@ def write_study(results: Results, path: Path) -> list[tuple[str, str, str]]:
 
 
 def _card(
-    name: str, one: summary.Estimate, unit: str, refused: summary.Estimate | None = None
+    name: str, one: summary.Estimate, unit: str, total: int = 0, failed: str = ''
 ) -> tuple[str, str, str]:
-    """Return a main result; without a value, words with the number of refused samples."""
+    """Return a main result, with the number of its samples and the failed ones if fewer."""
     if not one.samples:
-        count = 0 if refused is None or not refused.samples else refused.value * refused.samples
-        return name, 'no sample has a value', f'{count:.0f} refused' if count else ''
+        return name, 'no sample has a value', failed
     value, ends = _rounded(one, unit)
     sign = '' if unit == '%' else _shown(unit)[0]
-    return name, f'{value} {sign}'.rstrip(), _note(ends, sign)
+    note = _note(ends, sign)
+    if one.samples < total:
+        note += f'; of {one.samples} of {total} samples' + (failed and f': {failed}')
+    return name, f'{value} {sign}'.rstrip(), note
 
 
 def _shown(unit: str) -> tuple[str, float]:

@@ -36,6 +36,7 @@ from needle_study.steering import SteeringScenario
 from needle_study.study import build_study, read_study, Study
 from needle_study.summary import column, indices, NOISE, probability, quantile, worst
 import numpy as np
+from pyarrow import parquet
 import pytest
 from scipy import stats
 from support.installed import ROOT
@@ -327,12 +328,28 @@ def test_own_scenario_of_a_file_outside(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ('body', 'reason'),
     [
-        ("yield {'height': 1.0}", "got 1: [{'height': 1.0}]"),
+        ("yield {'height': 1.0}", 'the metrics of each of 10 samples by name, got 1'),
         ('yield from 20 * [{}]', 'the metrics of each of 10 samples by name, got 20'),
-        ('return None', 'got 0: []'),
-        ('yield from 10 * [1.0]', 'got 10: [1.0]'),
-        ("yield from len(rows) * [{'hit': None}]", 'the metric hit must be a number, got None'),
-        ("yield from len(rows) * [{'height': 'high'}]", "height must be a number, got 'high'"),
+        ('return None', 'of each of 10 samples by name, got 0'),
+        ('yield from 10 * [1.0]', 'the metrics of a sample by name, got 1.0'),
+        (
+            "yield from len(rows) * [{'hit': None}]",
+            'the metric hit must be a finite number, or NaN, got None',
+        ),
+        (
+            "yield from len(rows) * [{'height': 'high'}]",
+            "height must be a finite number, or NaN, got 'high'",
+        ),
+        (
+            "yield from 9 * [{}] + [{'heigth': 1.0}]",
+            "the metric 'heigth' is not one of metrics: height, hit",
+        ),
+        ("yield {'height': float('inf')}", 'height must be a finite number, or NaN, got inf'),
+        ("yield {'height': -float('inf')}", 'height must be a finite number, or NaN, got -inf'),
+        ("yield {'hit': 0.5}", 'the metric hit is yes or no: 1, 0 or NaN, got 0.5'),
+        ("yield {'hit': 7}", 'the metric hit is yes or no: 1, 0 or NaN, got 7'),
+        # At the first sample, before the others.
+        ("yield {'hit': 2}\n        raise AssertionError", 'hit is yes or no'),
     ],
 )
 def test_faulty_results_of_an_own_scenario_are_one_line(
@@ -572,6 +589,57 @@ def test_samples_without_a_value_are_words(
     assert 'nan' not in text.partition('Probabilities')[0].partition('<dl')[2]
 
 
+def test_medians_state_the_samples_without_a_value(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the terminal, on the page and in Python."""
+    more = """\
+    metrics = {**Throw.metrics, 'refused': Metric('', 'not simulated'),
+               'stopped': Metric('', 'stopped before the end')}
+
+    def insert(self, rows, streams):
+        for row, found in zip(rows, super().insert(rows, streams)):
+            speed = row['speed']
+            yield {'refused': 1} if speed < 1.1 else {'stopped': 1} if speed < 1.3 else found
+"""
+    document = {'samples': 100, 'population': {'speed': {'uniform': [1, 2]}}}
+    cards, text = page_of(tmp_path, monkeypatch, more, **document)
+    speeds = column(tmp_path / 'out/samples.parquet', 'speed')
+    counts = [int(np.sum(one)) for one in (speeds >= 1.3, speeds < 1.1)]
+    counts.append(100 - sum(counts))
+    words = '; of {} of 100 samples: {} refused, {} stopped'.format(*counts)
+    ((_, _, note),) = [one for one in cards if one[0] == 'Median height']
+    assert note.endswith(words)
+    assert words in text
+    (name,) = [path.stem for path in tmp_path.glob('own_*.py')]
+    table = build_study({'scenario': f'{name}:One', **document}).simulate()
+    said = ' m of {} samples, .*, {} refused, {} stopped>'.format(*counts)
+    assert re.search(rf'median height \S+{said}', repr(table))
+
+
+@pytest.mark.filterwarnings('error')
+def test_table_of_refused_samples_has_no_values(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = {**SMALL['settings'], 'law': 'multi_hypothesis'}
+    population = {'target_x': 0.1}
+    table = build_study(
+        {**SMALL, 'settings': settings, 'population': population, 'correlations': [], 'samples': 3}
+    ).simulate()
+    assert repr(table) == '<StudyTable: 3 samples, no value of miss, hit 0.0%, 3 refused>'
+
+
+def test_columns_of_a_table_have_their_units(tmp_path: Path) -> None:
+    """In the schema of the file, as in the names of Python."""
+    study = build_study({**SMALL, 'samples': 2})
+    results = Results(tmp_path / 'results', study)
+    compute(results, here, 1, lambda _: None)
+    schema = parquet.read_schema(results.table)
+    heads = [f'{one.name} [{one.metadata[b"unit"].decode()}]' for one in schema]
+    assert heads == [*study.simulate().columns()]
+    assert {'target_x [m]', 'lost [1]', 'miss [m]', 'hit [1]', 'load [N]'} <= {*heads}
+
+
 def test_page_of_one_sample_has_no_intervals(tmp_path: Path) -> None:
     results = Results(tmp_path / 'results', build_study({**SMALL, 'samples': 1}))
     compute(results, here, 1, lambda _: None)
@@ -704,6 +772,43 @@ def test_replicates_give_the_interval_of_a_sobol_design() -> None:
     # Three standard errors of 300 intervals.
     assert held.min() / 300.0 > 0.95 - 3.0 * sqrt(0.95 * 0.05 / 300.0)
     assert (width[:, 0] < 0.5 * width[:, 1]).all()
+
+
+@pytest.mark.parametrize('part', [0.5, 0.9])
+@pytest.mark.parametrize('samples', [256, 1000, 1024])
+@pytest.mark.parametrize('dimensions', [1, 2])
+def test_quantiles_of_a_sobol_design_have_sensible_intervals(
+    part: float, samples: int, dimensions: int
+) -> None:
+    """Of exp(u) and of u + v: each sequence may have the same number of values on each side."""
+    true = np.exp(part) if dimensions == 1 else 2.0 - sqrt(2.0 - 2.0 * part)
+    found, count = [], 300
+    for seed in range(count):
+        design = SobolDesign(samples, seed, np.eye(dimensions))
+        x = design.parts(0, samples)
+        found.append(quantile(np.exp(x[:, 0]) if dimensions == 1 else x.sum(axis=1), part, design))
+    value, low, high, _ = np.transpose(found)
+    assert ((low <= value) & (value <= high)).all()
+    held = np.mean((low <= true) & (true <= high))
+    assert held > 0.95 - 3.0 * sqrt(0.95 * 0.05 / count)
+    half = 0.5 * np.mean(high - low) / value.std()
+    # Of a normal distribution 1.96. Without scatter at the quantile of one variable the interval
+    # has the nearest values of all sequences.
+    assert 1.6 < half < 8.0
+
+
+@pytest.mark.parametrize('part', [0.5, 0.95])
+@pytest.mark.parametrize('more', [1, 4])
+def test_quantiles_of_independent_samples_hold_in_replicates(part: float, more: int) -> None:
+    """As noise gives them, from the least number of samples on."""
+    samples, rng = round(more * 32 / (1.0 - part)), np.random.default_rng(2)
+    design, true = SobolDesign(samples, 1, np.eye(1)), stats.expon.ppf(part)
+    found = [quantile(rng.exponential(size=samples), part, design) for _ in range(1000)]
+    held = np.mean([one.low <= true <= one.high for one in found])
+    assert abs(held - 0.95) < 3.0 * sqrt(0.95 * 0.05 / 1000) + 0.005
+    width = np.mean([one.high - one.low for one in found])
+    # Normal, with the density at the quantile.
+    assert width == pytest.approx(3.92 * sqrt(part / (1.0 - part) / samples), rel=0.2)
 
 
 def test_variance_fractions_of_a_sum_are_exact() -> None:
@@ -899,6 +1004,8 @@ def test_damaged_tables_and_other_versions_are_rejected(
         ({'population': {'tilt_x': {'normal': [0, -1]}}}, 'must have standard deviation > 0'),
         ({'population': {'tilt_x': {'uniform': [1, 0]}}}, 'uniform must have low < high'),
         ({'population': {'tilt_x': {'normal': [0, float('nan')]}}}, 'takes finite numbers'),
+        ({'population': {'target_x': {'uniform': [-4, 4]}}}, 'finite and in [-0.2, 0.2] m, and w'),
+        ({'population': {'target_z': 0.21}}, 'target_z must be finite and in [-0.2, 0.2] m'),
         ({'population': {'tilt_x': {'normal': [0, 0.2]}}}, 'in [-0.5, 0.5] rad, and would'),
         ({'population': {'skin': {'uniform': [-1, 1]}}}, 'skin must be finite and in [0, 1000]'),
         ({'population': {'skin': {'normal': [1, 0.1], 'within': [90, 91]}}}, 'with values of the'),

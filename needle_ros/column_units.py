@@ -6,6 +6,9 @@ from math import pi
 import re
 from typing import Final
 
+from needle_ros.errors import ParameterError
+from needle_ros.quantities import factors
+
 _INCH: Final = 0.0254  #: [m]
 _MICRO: Final = ('u', 'µ', '\u03bc')  #: Prefixes of 1e-6: letter u, micro sign, Greek letter.
 _LENGTHS: Final = {
@@ -40,6 +43,11 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     **dict.fromkeys(('roll', 'tilt_x', 'tilt_z'), _ANGLES),
 }
 
+#: Further units of columns, by SI unit.
+_OTHERS: Final = {
+    's': UNITS['time'], 'm': _LENGTHS, 'm/s': UNITS['speed'], 'N': UNITS['force'], 'rad': _ANGLES
+}  # fmt: skip
+
 ONLY_IN_BRACKETS: Final = ('in', 'h')  #: Units that are usual endings of names.
 
 #: A name with a word in brackets after it.
@@ -47,13 +55,29 @@ BRACKETS: Final = re.compile(r'^(.*?)\s*[\[(]([^\])]*)[\])]\s*$')
 
 
 def unit_of(name: str, role: str) -> str | None:
+    return _stated(name, UNITS[role])
+
+
+def factor_of(name: str, unit: str) -> float:
+    """Return the factor of a column to an SI unit, 1 without a unit in its name."""
+    known = {**factors(unit), **_OTHERS.get(unit, {})}
+    stated = _stated(name, known)
+    if stated is None and (foreign := foreign_unit(name)):
+        raise ParameterError(
+            f'the unit {foreign!r} of the column {name!r} is not one of {", ".join(known)}: '
+            'rename the column'
+        )
+    return known[stated] if stated else 1.0
+
+
+def _stated(name: str, known: Mapping[str, float]) -> str | None:
     if match := BRACKETS.match(name):
         word = match[2].strip()
     else:
         _, _, word = name.rpartition('_')
         if word in ONLY_IN_BRACKETS:
             return None
-    return word if word in UNITS[role] and word != name else None
+    return word if word in known and word != name else None
 
 
 def foreign_unit(name: str) -> str:
