@@ -11,9 +11,9 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from needle_dynamics import FloatArray
-from needle_dynamics.arrays import BoolArray, floats
-from needle_ros.errors import ParameterError, ShapeError
-from needle_ros.settings import check_choice
+from needle_dynamics.arrays import BoolArray, floats, IntArray
+from needle_ros.errors import ParameterError
+from needle_ros.settings import check_choice, check_whole, LARGEST_SEED
 from needle_study.scenario import check_names
 import numpy as np
 
@@ -34,8 +34,6 @@ _NO_EPISODE: Final = 'the episode is over, or none has begun: call reset'
 
 def checked_actions(actions: Any, shape: tuple[int, ...]) -> FloatArray:
     """Return actions as floats clipped to [-1, 1]; they must be finite and have the shape."""
-    if isinstance(actions, np.ndarray) and actions.dtype.kind not in 'fiub':
-        raise ShapeError(f'actions must be real numbers, got an array of {actions.dtype}')
     return floats('actions', actions, shape).clip(-1.0, 1.0)
 
 
@@ -136,7 +134,7 @@ class NeedleEnv(gymnasium.Env[FloatArray, FloatArray]):
 
 
 class NeedleVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
-    """Environments of n needles, each with its own seed, for up to ``longest`` steps."""
+    """Environments of n needles, each with its own seed, for up to ``longest`` steps if given."""
 
     metadata: ClassVar[dict[str, Any]] = {
         **NeedleEnv.metadata, 'autoreset_mode': AutoresetMode.NEXT_STEP,
@@ -147,12 +145,14 @@ class NeedleVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
         num_envs: int,
         needles: Callable[[int], Needles],
         render_mode: str | None,
-        longest: float = inf,
+        longest: int | None,
     ) -> None:
         if render_mode is not None:
             check_choice('render_mode', render_mode, self.metadata['render_modes'])
+        if longest is not None:
+            check_whole('max_episode_steps', longest, 1, LARGEST_SEED)
         self.num_envs, self.render_mode = num_envs, render_mode
-        self._needles, self._longest = needles(num_envs), longest
+        self._needles, self._longest = needles(num_envs), longest or inf
         self.single_action_space = self._needles.action_space
         self.single_observation_space = self._needles.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -173,17 +173,18 @@ class NeedleVectorEnv(VectorEnv[FloatArray, FloatArray, FloatArray]):
     def reset(
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: int | Sequence[int | None] | IntArray | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[FloatArray, dict[str, Any]]:
         """
         Start an episode in each environment, or in those of the option ``reset_mask``.
 
-        An integer seed counts up from the first environment. In a sequence, None continues the
-        random numbers of its environment.
+        An integer seed counts up from the first environment. In a sequence or array, None
+        continues the random numbers of its environment.
         """
         super().reset(options=options)
         seeds: list[int | None] = [None] * self.num_envs
+        seed = seed.tolist() if isinstance(seed, np.ndarray) else seed
         if isinstance(seed, Sequence):
             seeds = list(seed)
         elif seed is not None:

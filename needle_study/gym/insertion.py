@@ -10,7 +10,7 @@ from gymnasium import spaces
 from needle_dynamics import FloatArray, NeedleModel, NeedleParameters
 from needle_dynamics.arrays import BoolArray
 from needle_dynamics.compiled.boxed import Boxed
-from needle_ros.errors import ParameterError
+from needle_ros.settings import checked
 from needle_study.gym.environment import NeedleEnv, NeedleVectorEnv, picture
 from needle_study.gym.pushed import BOUND, FORCE, observe, push, Pushed, START, Tissues, UNITS
 import numpy as np
@@ -28,8 +28,7 @@ class _Needles:
     options = ()
 
     def __init__(self, needle: str, spread: float, number: int) -> None:
-        if not 0.0 <= spread <= 1.0:
-            raise ParameterError(f'spread must be in [0, 1], got {spread!r}')
+        checked('spread', spread, low=0.0, high=1.0)
         self._nominal, self._spread = NeedleParameters.preset(needle), spread
         model = NeedleModel(self._nominal)
         self._start, common = model.state_at(START), model.compiled
@@ -72,7 +71,11 @@ class _Needles:
     def info(self, ends: Any) -> dict[str, Any]:
         n = self._needles
         errors = n.targets - (n.common.length - n.states[:, 0])
-        return {'error': errors, 'force': self._forces.copy(), 'success': ends > 0}
+        success = ends > 0
+        return {
+            'error': errors, 'force': self._forces.copy(),
+            'success': success, 'is_success': success.copy(),
+        }  # fmt: skip
 
     def picture(self, k: int) -> Any:
         n = self._needles
@@ -95,7 +98,7 @@ class InsertionEnv(NeedleEnv):
     Reward: decrease of the error as a fraction of the initial error, minus 0.001 for the period
     and 0.003 times the square of the action; 1 more at the target, 2 less outside the range. The
     sum is below 2, and -0.5 for a needle at rest for 500 periods. Info: ``error`` of depth [m],
-    ``force`` [N], ``success``.
+    ``force`` [N], ``success`` and its common name ``is_success``.
     """
 
     def __init__(
@@ -111,7 +114,7 @@ class InsertionVectorEnv(NeedleVectorEnv):
         self,
         num_envs: int = 1,
         needle: str = 'phantom',
-        max_episode_steps: int = 500,
+        max_episode_steps: int | None = 500,
         render_mode: str | None = None,
         *,
         spread: float = SPREAD,

@@ -38,10 +38,14 @@ from needle_study.gym.steered import (
     steer,
     SteeredNeedles,
 )
+from needle_study.steering import SteeringStudy
 import numpy as np
 
 #: Default distribution of the unknown disturbances of a needle.
 PRIOR: Final = SteeringPrior(tilt=0.02, frame=0.03, bevel=0.1)
+
+#: Largest distance from the target of a success [m], as of a hit in studies.
+HIT: Final = SteeringStudy().hit_radius
 
 _FPS: Final = {'render_fps': 2}
 
@@ -67,6 +71,7 @@ class _Needles:
         reach = self._needle.length - steering.free_length
         if depth > reach:
             raise ParameterError(f'depth must be <= {reach:g} m with this needle, got {depth!r} m')
+        checked('aside', aside, 'm', high=self._needle.length)
         self._steering = replace(
             steering, path_noise=prior.path_noise, path_noise_length=prior.path_noise_length
         )
@@ -130,7 +135,13 @@ class _Needles:
         if truth is not None:
             self._place(0, truth)
         if 'target' in options:
-            self._needles.targets[:] = checked_target(options['target'])
+            target, length = checked_target(options['target']), self._needle.length
+            if np.abs(target).max() > length:
+                raise ParameterError(
+                    f'target must be in [-{length:g}, {length:g}] m, the length of the needle, '
+                    f'got {target.tolist()}'
+                )
+            self._needles.targets[:] = target
 
     def _place(self, k: int, truth: GroundTruth) -> None:
         """Replace needle k, and place it on the skin."""
@@ -150,8 +161,9 @@ class _Needles:
         found, self._tips = observe(self._boxed)
         return np.asarray(found)
 
-    def info(self, _ends: Any) -> dict[str, Any]:
-        return {'tip': self._tips[:, :2], 'miss': self._tips[:, 2]}
+    def info(self, ends: Any) -> dict[str, Any]:
+        miss = self._tips[:, 2]
+        return {'tip': self._tips[:, :2], 'miss': miss, 'is_success': (ends > 0) & (miss <= HIT)}
 
     def picture(self, k: int) -> Any:
         group, lane = divmod(k, LANES)
@@ -170,7 +182,8 @@ class SteeringEnv(NeedleEnv):
     The observation is the depth over the target depth, and as fractions of the guide limit the
     measured tip, the target and the guide, each x and z. The reward at the end is the negative
     distance of the tip from the target [mm], before it is 0. Info: ``tip``, the true tip in x and
-    z [m]; ``miss``, its distance from the target in this plane [m]. Images show the plane of z.
+    z [m]; ``miss``, its distance from the target in this plane [m]; ``is_success``, whether the
+    episode has ended within 1 mm of the target. Images show the plane of z.
 
     Options of `reset`: ``truth``, a `GroundTruth`, and ``target``, x and z [m].
     """
@@ -193,7 +206,7 @@ class SteeringEnv(NeedleEnv):
 
 
 class SteeringVectorEnv(NeedleVectorEnv):
-    """Needles as in `SteeringEnv`, each with its own seed."""
+    """Needles as in `SteeringEnv`, each with its own seed, for up to `max_episode_steps`."""
 
     metadata: ClassVar[dict[str, Any]] = {**NeedleVectorEnv.metadata, **_FPS}
 
@@ -208,6 +221,7 @@ class SteeringVectorEnv(NeedleVectorEnv):
         aside: float = 4e-3,
         prior: SteeringPrior = PRIOR,
         render_mode: str | None = None,
+        max_episode_steps: int | None = None,
     ) -> None:
         needles = partial(_Needles, needle, depth, step_length, guide_limit, aside, prior)
-        super().__init__(num_envs, needles, render_mode)
+        super().__init__(num_envs, needles, render_mode, max_episode_steps)

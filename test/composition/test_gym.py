@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.episodes import Maker, Policy, ready, SteeringPolicy, total_rewards
-from benchmarks.policies import EXPERT, returns
+from benchmarks.policies import EXPERT, policies, returns
 import gymnasium
 from gymnasium.utils.env_checker import check_env
 from needle_controller import GuideSetpoint, SIMULATION_LIMITS, SteeringPrior
@@ -206,7 +206,7 @@ def test_next_episode_has_the_population_again() -> None:
     assert np.array_equal(environment.reset(seed=3)[0], other.reset(seed=3)[0])
     action = np.ones(2)
     assert np.array_equal(environment.step(action)[0], other.step(action)[0])
-    for target in ((1.0, 2.0, 3.0), (np.nan, 0.0)):
+    for target in ((1.0, 2.0, 3.0), (np.nan, 0.0), (4.0, 0.0), (0.0, -0.21)):
         with pytest.raises(NeedleError, match='target must'):
             environment.reset(options={'target': target})
 
@@ -228,6 +228,9 @@ def test_vector_seeds_and_masks() -> None:
     some, _ = many.reset(options={'reset_mask': np.array([True, False, False])})
     assert np.array_equal(some[1:], before[1:])
     assert some[0][1] == 0.0
+    listed, _ = other.reset(seed=[3, 9, 4])
+    for seed in ((3, 9, 4), np.array([3, 9, 4])):
+        assert np.array_equal(many.reset(seed=seed)[0], listed)
     for options in ({'seed': [1, 2]}, {'options': {'reset_mask': np.ones(2, dtype=bool)}}):
         with pytest.raises(ParameterError, match='must be of 3 environments'):
             many.reset(**options)
@@ -257,7 +260,9 @@ def test_environment_equals_the_integrator() -> None:
             left = False
         progress = (before - abs(target - one.depth)) / abs(target - START)
         assert reward == progress - 0.001 - 0.003 - (2.0 if left else 0.0)
-        assert info == {'error': target - one.depth, 'force': force, 'success': False}
+        assert info == {'error': target - one.depth, 'force': force} | dict.fromkeys(
+            ('success', 'is_success'), False
+        )
         assert over == left
         if left:
             break
@@ -276,7 +281,7 @@ def test_environment_equals_the_integrator() -> None:
         (np.zeros((3, 1)), ShapeError, r'actions must have shape \(64, 1\), got \(3, 1\)'),
         (np.zeros(64), ShapeError, r'actions must have shape \(64, 1\), got \(64,\)'),
         (0.5, ShapeError, r'actions must have shape \(64, 1\), got \(\)'),
-        ('in', ShapeError, r"actions must be numbers, got 'in'"),
+        ('in', ShapeError, r"actions must be real numbers, got 'in'"),
         (
             1j * np.ones((64, 1)),
             ShapeError,
@@ -349,8 +354,55 @@ def test_spread_of_the_needles_is_an_option() -> None:
     after, *_ = environments.step(np.full((4, 1), 0.5))
     assert len(set(first[:, 0])) == 4
     assert len(set(after[:, 1])) == 1
-    with pytest.raises(ParameterError, match=r'^spread must be in \[0, 1\], got 1\.5$'):
+    with pytest.raises(ParameterError, match=r'^spread must be finite, >= 0 and <= 1, got 1\.5$'):
         InsertionEnv(spread=1.5)
+    with pytest.raises(ParameterError, match=r"^spread must be a number, got '0\.3'$"):
+        InsertionEnv(spread='0.3')  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize('name', ['NeedleInsertion-v0', 'NeedleSteering-v0'])
+@pytest.mark.parametrize('mode', ['sync', 'vector_entry_point'])
+def test_vectors_truncate_after_max_episode_steps(name: str, mode: str) -> None:
+    many = gymnasium.make_vec(
+        f'needle_study.gym:{name}', 2, vectorization_mode=mode, max_episode_steps=5
+    )
+    many.reset(seed=1)
+    for k in range(1, 12):
+        _, _, over, late, _ = many.step(np.zeros(many.action_space.shape))
+        assert not over.any()
+        # A truncated episode restarts at the next step.
+        assert late.all() == late.any() == (k % 6 == 5)
+    many.close()
+    with pytest.raises(ParameterError, match=r'^max_episode_steps must be an integer from 1 '):
+        InsertionVectorEnv(2, max_episode_steps=0)
+    with pytest.raises(ParameterError, match=r'^max_episode_steps must be an integer from 1 '):
+        SteeringVectorEnv(2, max_episode_steps=0)
+
+
+def test_success_is_an_end_at_the_target() -> None:
+    """True only at the end: of steering within 1 mm, of insertion at rest at the target."""
+    needle, steering, _ = find_needle(DEFAULT_NEEDLE)
+    none = np.zeros(2)
+    straight = GroundTruth(
+        needle=needle, steering=steering, tilt=(0.0, 0.0), bevel=none, frame=none, seed=0
+    )
+    for aside, success in ((0.9e-3, True), (1.1e-3, False)):
+        environment, over = SteeringEnv(), False
+        environment.reset(seed=1, options={'truth': straight, 'target': (aside, 0.0)})
+        while not over:
+            *_, over, _, info = environment.step(np.zeros(2))
+            assert info['is_success'] == (over and success)
+    many, ends, policy = InsertionVectorEnv(8, spread=0.0), 0, policies(8)[EXPERT]
+    running = np.ones(8, dtype=bool)
+    seen, _ = many.reset(seed=1)
+    for _ in range(400):
+        seen, rewards, over, _, info = many.step(policy(seen, running))
+        assert np.array_equal(info['is_success'], info['success'])
+        # The reward of an end at the target is above 0, of one outside the range below.
+        assert np.array_equal(info['is_success'], over & (rewards > 0.0))
+        assert info['_is_success'].all()
+        ends += info['is_success'].sum()
+    assert ends >= 8
 
 
 def test_a_good_controller_earns_more_than_every_trivial_policy() -> None:
@@ -435,6 +487,7 @@ def test_unknown_options_of_reset_are_rejected(made: Any, option: str, valid: st
         ({'needle': 'bone'}, 'needle must be one of'),
         ({'depth': 0.0}, 'depth must be finite, > 0 m'),
         ({'depth': 1.0}, 'depth must be <='),
+        ({'aside': 4.0}, 'aside must be finite, <= 0.2 m, got 4.0'),
     ],
 )
 def test_invalid_options_are_rejected(options: dict[str, object], complaint: str) -> None:
