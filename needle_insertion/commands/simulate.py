@@ -238,6 +238,7 @@ def _run_steering(needle_name: str, options: argparse.Namespace) -> int:
         _insert(recorder, motion, show, to, speed, interval)
     for path in options.output:
         report.write(path, recorder)
+    common.print_each('warning', report.warnings(recorder))
     summary = report.summary(recorder)
     rows = [(key, f'{value + 0.0:.6g}') for key, value in summary.items()]
     text = (

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, TYPE_CHECKING, TypeVar
 
@@ -27,6 +27,7 @@ COLUMNS: Final = (
     'torque_x [N m]', 'torque_y [N m]', 'torque_z [N m]',
 )  # fmt: skip
 
+_LINEAR: Final = 0.3  #: largest slope of a linear beam
 _DRAWN: Final = 4  #: number of drawn needle shapes
 _WIDTH: Final = 9.0  #: width of the picture [in]
 _MARGIN: Final = 4.0  #: margin around a needle [mm]
@@ -55,6 +56,10 @@ class InsertionRecord:
         return np.array(self._rows)
 
     @property
+    def largest_slope(self) -> float:
+        return float(max(np.abs(one.slopes).max() for one in self._shapes))
+
+    @property
     def shapes(self) -> list[NeedleShape]:
         """Needle shapes at evenly spaced samples, including the last."""
         return evenly(self._shapes, _DRAWN + 1)[1:]
@@ -73,13 +78,22 @@ def summary(record: InsertionRecord) -> dict[str, float]:
         'depth at the end [m]': float(column['depth [m]'][-1]),
         'tip at the end, x [m]': float(column['tip_x [m]'][-1]),
         'tip at the end, z [m]': float(column['tip_z [m]'][-1]),
-        'largest slope': float(max(np.abs(one.slopes).max() for one in record.shapes)),
+        'largest slope': record.largest_slope,
         'largest axial force [N]': float(np.abs(column['force [N]']).max()),
         'largest lateral force on the guide [N]': float(
             np.hypot(column['force_x [N]'], column['force_z [N]']).max()
         ),
         'membranes punctured': float(sum(record.one.punctured)),
     }
+
+
+def warnings(record: InsertionRecord) -> Iterator[str]:
+    """Yield a warning if the needle bends beyond the validity of the model."""
+    if record.largest_slope > _LINEAR:
+        yield (
+            f'the largest slope of the needle is {record.largest_slope:.2g}: a linear beam is '
+            f'valid up to about {_LINEAR:g}'
+        )
 
 
 def write(path: Path, record: InsertionRecord) -> None:

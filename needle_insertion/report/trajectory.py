@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, TYPE_CHECKING
 
-from needle_dynamics import linearize, NeedleModel, Trajectory
+from needle_dynamics import FloatArray, linearize, NeedleModel, Trajectory
 from needle_insertion.report.content import csv_table, png
 from needle_ros.contract import ground_truth, JOINT_STATES, TIP_DEFLECTION, Topic
 from needle_ros.files import write_whole
@@ -76,14 +76,21 @@ def warnings(trajectory: Trajectory) -> Iterator[str]:
 def write(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory to a ``.csv`` or ``.png`` file, or as a bag to a new folder."""
     if path.suffix == '.csv':
-        names = NeedleModel(trajectory.parameters).coordinate_names
-        heads = ['time', *names, *(f'{name}_dot' for name in names), 'tip_deflection']
-        columns = (trajectory.time, trajectory.states, trajectory.tip_deflection)
-        write_whole(path, csv_table(heads, np.column_stack(columns)))
+        columns = _columns(trajectory)
+        write_whole(path, csv_table([*columns], np.column_stack([*columns.values()])))
     elif path.suffix == '.png':
         write_whole(path, png(_figure(trajectory)))
     else:
         write_bag(path, _messages(trajectory))
+
+
+def _columns(trajectory: Trajectory) -> dict[str, FloatArray]:
+    """Return the columns of a trajectory, and the rest of its states."""
+    d, theta, *modal = NeedleModel(trajectory.parameters).coordinate_names
+    units = {d: 'm', theta: 'rad', **dict.fromkeys(modal, 'm^3/2')}
+    heads = [f'{name} [{unit}]' for name, unit in units.items()]
+    heads += [f'{name}_dot [{unit}/s]' for name, unit in units.items()]
+    return trajectory.columns() | dict(zip(heads, trajectory.states.T, strict=True))
 
 
 def write_bag(path: Path, messages: Iterable[tuple[Topic, int, Sequence[float]]]) -> None:

@@ -26,10 +26,15 @@ def test_csv_and_bag_contain_the_run(tmp_path: Path) -> None:
     run = simulate(p, start, 3.0, duration=0.005, interval=1e-4)
     with (tmp_path / 'run.csv').open() as file:
         rows = list(csv.reader(file))
-    assert rows[0][:5] == ['time', 'd', 'theta', 'q1', 'q2']
-    values = np.array(rows[1:], dtype=float)
-    assert np.array_equal(values[:, 1:9], run.states)
-    assert np.array_equal(values[:, 9], run.tip_deflection)
+    # Each with its unit, as of the other model.
+    assert all(re.fullmatch(r'\w+ \[\S+\]', name) for name in rows[0])
+    values = dict(zip(rows[0], np.array(rows[1:], dtype=float).T, strict=True))
+    heads = ['d [m]', 'theta [rad]', 'q1 [m^3/2]', 'q2 [m^3/2]', 'd_dot [m/s]']
+    heads += ['theta_dot [rad/s]', 'q1_dot [m^3/2/s]', 'q2_dot [m^3/2/s]']
+    assert np.array_equal(np.transpose([values.pop(name) for name in heads]), run.states)
+    expected = run.columns()
+    assert [*values] == [name for name in expected if name[0] != 'q']
+    assert all(np.array_equal(value, expected[name]) for name, value in values.items())
     truth = read_topic(tmp_path / 'bag', '/ground_truth')
     states = np.array([[*m.position, *m.velocity] for _, m in truth])
     assert np.array_equal(states, run.states)
@@ -60,9 +65,10 @@ def test_json_contains_the_summary(capsys: pytest.CaptureFixture[str]) -> None:
         (['--set', 'mass=1'], "unknown parameter 'mass'"),
         (['--set', 'modes'], '--set takes NAME=VALUE'),
         (['--depth', '0.3'], 'insertion depth 0.3 m is outside'),
-        (['--interval', '0'], 'interval and duration must be positive'),
+        (['--interval', '0'], 'interval must be finite, > 0 s, got 0'),
         (['-o', 'run.xlsx'], 'output must be .csv, .png or a folder'),
         (['--tolerance', '-1'], 'tolerance must be finite, > 0'),
+        (['--tip-deflection', '5'], 'tip_deflection must be finite, >= -0.2 and <= 0.2 m, got 5'),
     ],
 )
 def test_invalid_input_is_a_one_line_error(

@@ -135,3 +135,14 @@ def test_invalid_guide_tables_are_named(
     way.write_text(text)
     words = ['--model', 'steering', '--motion', str(way)]
     assert complaint in said(capsys, *words, status=2)[1]
+
+
+@pytest.mark.parametrize(('aside', 'warned'), [(10, False), (50, True)])
+def test_slopes_beyond_a_linear_beam_are_warned_of(
+    aside: int, warned: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    way = tmp_path / 'way.csv'
+    way.write_text(f'depth [mm],guide_z [mm]\n0,0\n50,{aside}\n100,0\n')
+    found, err = said(capsys, '--model', 'steering', '--motion', str(way), '--json')
+    assert (found['largest slope'] > 0.3) == warned
+    assert ('a linear beam is valid up to about 0.3' in err) == warned
