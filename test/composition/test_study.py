@@ -233,7 +233,7 @@ def test_variables_of_a_table_have_values_of_the_same_row(tmp_path: Path) -> Non
 @pytest.mark.parametrize('samples', [1, 2, 5, 64, 1000, 1025])
 def test_latin_design_has_one_sample_per_stratum(samples: int) -> None:
     """In every dimension, and the strata of the dimensions are uncorrelated."""
-    names = ('target_x', 'target_z', 'tilt_x')
+    names = ('frame_x', 'frame_z', 'tilt_x')
     population = {name: {'uniform': [0.0, 0.5]} for name in names}
     drawn = build_study(
         {'scenario': 'steering', 'samples': samples, 'seed': 8, 'design': 'latin',
@@ -250,11 +250,11 @@ def test_latin_design_has_one_sample_per_stratum(samples: int) -> None:
 @pytest.mark.parametrize('correlation', [-0.9, 0.5])
 def test_correlations_keep_the_strata_of_a_latin_design(correlation: float) -> None:
     """One sample per stratum in every dimension, and the rank correlation of a normal copula."""
-    samples, names = 1000, ('target_x', 'target_z', 'tilt_x')
+    samples, names = 1000, ('frame_x', 'frame_z', 'tilt_x')
     drawn = build_study(
         {'scenario': 'steering', 'samples': samples, 'seed': 8, 'design': 'latin',
          'population': {name: {'uniform': [0.0, 0.5]} for name in names},
-         'correlations': [['target_x', 'tilt_x', correlation]]}
+         'correlations': [['frame_x', 'tilt_x', correlation]]}
     ).draw(0, samples)  # fmt: skip
     strata = np.array([np.floor(drawn[name] / 0.5 * samples) for name in names])
     assert np.array_equal(np.sort(strata, axis=1), np.tile(np.arange(samples), (3, 1)))
