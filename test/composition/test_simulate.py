@@ -140,8 +140,8 @@ def test_runs_can_start_from_modal_coordinates(
     """q1 and q2 replace a tip deflection; both, or a wrong number of values, are rejected."""
     assert main([*SHORT, '--modal', '1e-5', '-2e-6', '-o', str(tmp_path / 'run.csv')]) == 0
     with (tmp_path / 'run.csv').open() as file:
-        first = list(csv.reader(file))[1]
-    assert [float(value) for value in first[3:5]] == [1e-5, -2e-6]
+        first = next(csv.DictReader(file))
+    assert [float(first[f'q{k} [m^3/2]']) for k in (1, 2)] == [1e-5, -2e-6]
     capsys.readouterr()
     assert main([*SHORT, '--modal', '1e-5']) == 2
     assert 'modal must have 2 numbers' in capsys.readouterr().err
