@@ -38,7 +38,7 @@ class Structure:
     name: str
     role: str  #: one of `ROLES`
     margin: float = 0.0  #: distance that the needle keeps from an obstacle [m]
-    stiffness: float = nan  #: median stiffness of tissue [N/m^2]; nan: that of the needle file
+    stiffness: float = nan  #: median stiffness of tissue [N/m^2]; nan: as in the needle file
     spread: float = nan  #: standard deviation of its logarithm [1]
     source: str = ''  #: source of the stiffness
 
@@ -222,7 +222,7 @@ def outside(
     """
     Return warnings of lengths outside of each image with obstacles, to the size of its voxels.
 
-    Closed surfaces have no further obstacles. The parameters are those of `before_tissue`.
+    Closed surfaces have no further obstacles. Parameters: see `before_tissue`.
     """
     lines, length = [], float(np.linalg.norm(target - entry))
     for anatomy in anatomies:

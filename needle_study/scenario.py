@@ -156,7 +156,7 @@ def class_files(address: str, found: Any) -> dict[str, str]:
     """
     Return the checksum of the source files of a class by its address ``module:Class``.
 
-    These are the files of its module and of its base classes, without those of this package,
+    These are the files of its module and of its base classes, without files of this package,
     NumPy and SciPy: nothing for a class of these.
     """
     if ':' not in address:

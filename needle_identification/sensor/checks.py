@@ -61,7 +61,7 @@ def _repeated(tip: FloatArray) -> tuple[BoolArray, bool]:
     lengths = np.diff(starts, append=len(tip))
     within = np.arange(len(tip)) - np.repeat(starts, lengths)
     count = np.count_nonzero(lengths > 1)
-    # A log at a higher rate than that of the sensor.
+    # The log has a higher rate than the sensor.
     if count >= _HELD * len(lengths):
         return np.asarray(within > 0), True
     # A run of more than j rows has the probability longer**j, by chance.

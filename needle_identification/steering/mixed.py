@@ -52,7 +52,7 @@ class Likelihood(NamedTuple):
     variances: FloatArray  #: (K,) of the white noise [m^2]
     values: FloatArray  #: (K, c) drift constants
     covariances: FloatArray  #: (K, c, c) of the drift constants
-    #: (K, N) residuals, whitened to the variance of the white noise, and those of the prior [m].
+    #: (K, N) residuals, whitened to the variance of the white noise, and of the prior [m].
     residuals: FloatArray
     known: float  #: effective number of drift constants that the tips determine
 
@@ -123,7 +123,7 @@ class MixedModel:
         rows = self._rows
         whitened = rows[:, :-c].reshape(len(rows), *planes.shape)
         np.matmul(self._half, planes, out=whitened)
-        # Products of all columns: those of slices are several times slower.
+        # Products of all columns: products of slices are several times slower.
         products = np.swapaxes(rows, 1, 2) @ rows
         normal = products[:, :c, :c]
         inverse = np.linalg.inv(normal)

@@ -49,8 +49,8 @@ _MOST_ASKED: Final = 8
 _MOVING: Final = ('target', 'resume', 'retract', 'clear')
 _LATE: Final = 1.0
 
-_CHECK: Final = 'check'  #: Request without effect, which tells a page whether its token is valid.
-_BEAT: Final = 0.25  #: period of the clock that a page receives, also without frames [s]
+_CHECK: Final = 'check'  #: Request without effect, whose answer is whether the token is valid.
+BEAT: Final = 0.25  #: period of the clock that a page receives, also without frames [s]
 
 _PATIENCE: Final = 10.0  #: timeout of a reader that accepts no data [s]
 _HEARTBEAT: Final = 20.0  #: period of the heartbeat of a WebSocket [s]
@@ -236,7 +236,7 @@ class Server:
         full = len(self._open) >= MOST_READERS
         await socket.prepare(request)
         if full:
-            # A browser does not tell its page the status of a rejected request.
+            # The status of a rejected request is not visible to a page.
             reason = f'{MOST_READERS} pages are open already: close one, then load this page again'
             await socket.close(code=WSCloseCode.TRY_AGAIN_LATER, message=reason.encode())
             return socket
@@ -309,7 +309,7 @@ class _Connection:
     async def beat(self) -> None:
         """Send the clock of commands: a page without it reports an interruption."""
         while await self._put(json.dumps({'clock': round(monotonic(), 3)})):
-            await asyncio.sleep(_BEAT)
+            await asyncio.sleep(BEAT)
 
     async def send(self) -> None:
         while True:

@@ -63,6 +63,20 @@ class Table:
         return self.planner.state
 
 
+def table_of_waiting_jobs(labels: Path) -> tuple[Table, list[Any]]:
+    """Return a planner whose jobs start by their method `run`, and the list of its jobs."""
+    jobs: list[Any] = []
+
+    class Waiting(Job[Any]):
+        def _start(self) -> None:
+            jobs.append(self)
+
+        def run(self) -> None:
+            Job._start(self)
+
+    return Table(settings_of(labels), start=Waiting), jobs
+
+
 def test_plan_is_that_of_the_anatomy(labels: Path, tmp_path: Path) -> None:
     """Of both inputs in any order, with needle, clearance and file."""
     structures = {
@@ -204,18 +218,7 @@ def test_refused_target_is_stated_until_one_is_accepted(labels: Path) -> None:
 
 
 def test_target_that_is_refused_while_planning_ends_the_plan(labels: Path) -> None:
-    jobs: list[Any] = []
-
-    class Waiting(Job[Any]):
-        """A job that runs when the test says so."""
-
-        def _start(self) -> None:
-            jobs.append(self)
-
-        def run(self) -> None:
-            Job._start(self)
-
-    table = Table(settings_of(labels), start=Waiting)
+    table, jobs = table_of_waiting_jobs(labels)
     table.planner.take_segmentation(segmentation())
     table.planner.take_target(TARGET)
     table.poll()
@@ -352,18 +355,7 @@ def test_newest_inputs_are_planned(labels: Path) -> None:
 
 def test_target_while_planning_replaces_the_plan(labels: Path) -> None:
     """The cancelled plan is not shown, although it may be complete."""
-    jobs: list[Any] = []
-
-    class Waiting(Job[Any]):
-        """A job that runs when the test says so."""
-
-        def _start(self) -> None:
-            jobs.append(self)
-
-        def run(self) -> None:
-            Job._start(self)
-
-    table = Table(settings_of(labels), start=Waiting)
+    table, jobs = table_of_waiting_jobs(labels)
     table.planner.take_segmentation(segmentation())
     table.poll()
     jobs[0].run()

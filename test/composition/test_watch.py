@@ -29,7 +29,7 @@ from needle_insertion import cli
 from needle_insertion.watch import recorded
 from needle_insertion.watch.live import Live, LiveReader, RecordedReader
 from needle_insertion.watch.recorded import PagePlayback, ShownRecording
-from needle_insertion.watch.server import LONGEST, MOST_READERS, Server
+from needle_insertion.watch.server import BEAT, LONGEST, MOST_READERS, Server
 from needle_insertion.watch.view import scene, SIGNALS, View
 from needle_ros import contract
 from needle_ros.errors import JobError, MessageError, ParameterError
@@ -748,23 +748,26 @@ def test_command_of_an_old_click_is_refused(what: str, age: Any) -> None:
                 assert said['success'] is False
                 assert 'click' in said['words']
             if age == 1.5 and not executed:
-                assert said['words'].startswith('not executed: the click was 1.5 s ago')
+                stated = float(said['words'].partition(' was ')[2].partition(' s ago')[0])
+                # To its last digit, and later on a busy machine.
+                assert age - 0.1 <= stated <= monotonic() - clicked + 0.1
 
     asyncio.run(asyncio.wait_for(look(), 60.0))
 
 
 @in_loop
 async def test_clock_is_sent_without_frames() -> None:
-    """At once, and several times a second, to a reader that acknowledges nothing."""
+    """Also to a reader that acknowledges nothing: the time of sending, to its last digit."""
     async with served() as page:
+        before, digit = monotonic(), 1e-3
         stream = await page.open()
-        times: list[float] = []
-        while len(times) < 5:
-            message = await asyncio.wait_for(stream.receive_json(), 60.0)
-            if 'clock' in message:
-                assert message['clock'] == pytest.approx(monotonic(), abs=0.5)
-                times.append(message['clock'])
-        assert times[-1] - times[0] == pytest.approx(1.0, abs=0.5)
+        for _ in range(5):
+            message: dict[str, Any] = {}
+            while 'clock' not in message:
+                message = await asyncio.wait_for(stream.receive_json(), 60.0)
+            assert before - digit < message['clock'] < monotonic() + digit
+            # The period, less the rounding of both times.
+            before = message['clock'] + BEAT - digit
 
 
 @in_loop
@@ -783,7 +786,7 @@ async def test_token_is_checked_without_a_command() -> None:
     'request_line',
     [f'GET / HTTP/1.1\r\nX: {"a" * 20_000}', f'GET /{"a" * 20_000}', 'GET / HTTP/1.1\r\nA : x'],
 )
-def test_rejected_request_is_one_line(
+def test_rejected_request_prints_one_line(
     request_line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without a traceback, and other requests are answered."""
