@@ -281,10 +281,12 @@ def adapt(
         c.period,
     )
     if memory[FOLLOWS] == 1.0 and c.ki > 0.0:
-        # The integral has compensated this friction: the sum of both does not change.
+        # The integral has compensated this friction: the sum of both does not change. Friction
+        # that is gone does not return to the integral.
         more = _learned(c, memory, memory[POSITION], memory[VELOCITY]) - known
         pf, vf = (c.pf, c.vf) if memory[VELOCITY] > 0.0 else (c.back_pf, c.back_vf)
-        memory[INTEGRAL] -= more * _divisor(c, pf, vf) / c.ki
+        integral, taken = memory[INTEGRAL], more * _divisor(c, pf, vf) / c.ki
+        memory[INTEGRAL] -= min(max(taken, min(integral, 0.0)), max(integral, 0.0))
 
 
 @inlined

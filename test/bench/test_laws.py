@@ -50,10 +50,11 @@ def test_default_law_is_first() -> None:
 
 
 def test_puncture_causes_overshoot() -> None:
-    """A force drop of 3 N causes an overshoot of about a tenth of a millimeter."""
+    """A force drop of 3 N causes an overshoot of a few tenths of a millimeter at most."""
     names = {one.name: one for one in situations()}
     puncture, law = names['puncture, 3 N'], laws()['adaptive']
-    cell = study(puncture, law, 0.3, 1, 2.0, 4)
+    # The cell with the largest one; the corners of the needles are its worst.
+    cell = study(puncture, law, 0.5, 2, 2.0, 8)
     plain = study(names['insertion'], law, 0.3, 1, 2.0, 4)
     assert 0.1e-3 < cell.beyond.max() < 0.3e-3
     assert plain.beyond.max() < 0.05e-3

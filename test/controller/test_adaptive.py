@@ -188,7 +188,7 @@ def test_learned_friction_is_taken_out_of_the_integral(direction: float) -> None
     own = law(replace(PHANTOM, withdrawal=0.7))
     loop = SampledLoop(own, 1, 20.0)
     memory, speed = loop.memory, direction * 0.01
-    memory[[INTEGRAL, POSITION, VELOCITY, FOLLOWS]] = 1e-4, 0.06, speed, 1.0
+    memory[[INTEGRAL, POSITION, VELOCITY, FOLLOWS]] = direction * 1e-3, 0.06, speed, 1.0
     memory[MEASURED : MEASURED + 3] = 1.0, 0.06 - speed * PERIOD, speed
     # The acceleration of the modeled motion is zero at its own setpoint.
     at = (0.06, speed, Setpoint(0.06, speed))
@@ -197,6 +197,19 @@ def test_learned_friction_is_taken_out_of_the_integral(direction: float) -> None
     assert np.abs(memory[LEARNED:] - block).max() > 0.01
     # Rounding of forces of a few newtons.
     assert own.force(*at, memory) == pytest.approx(before, abs=1e-12)
+
+
+@given(st.floats(-1e-4, 1e-4), st.floats(-20.0, 20.0), st.sampled_from([-0.01, 0.01]))
+def test_learning_takes_no_more_than_the_integral_has(
+    integral: float, force: float, speed: float
+) -> None:
+    """Friction that is gone does not return to the integral, which keeps its sign."""
+    own = law(PHANTOM)
+    memory = SampledLoop(own, 1, 20.0).memory
+    memory[[INTEGRAL, POSITION, VELOCITY, FOLLOWS]] = integral, 0.06, speed, 1.0
+    memory[MEASURED : MEASURED + 3] = 1.0, 0.06 - speed * PERIOD, speed
+    adapt(own.packed, memory, 0.06, speed, force)
+    assert min(integral, 0.0) <= memory[INTEGRAL] <= max(integral, 0.0)
 
 
 def test_learning_is_bumpless() -> None:
