@@ -2,15 +2,18 @@
 """
 Bare rclpy nodes for comparison: they publish the same messages without any computation.
 
-Run as ``python -m benchmarks.bare ROLE EXECUTOR``. No package of the suite is imported, so that
-its memory and garbage collection do not slow down these nodes.
+Run as ``python -m benchmarks.bare ROLE KIND``, with message objects or with serialized messages.
+No package of the suite is imported, so that its memory and garbage collection do not slow down
+these nodes.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 import ctypes
+import gc
 import signal
+import struct
 import sys
 import time
 from typing import Any, Final
@@ -18,10 +21,11 @@ from typing import Any, Final
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PointStamped, WrenchStamped
 import rclpy
-from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.executors import Executor
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -98,6 +102,82 @@ class Sender:
         return left
 
 
+class Template:
+    """Serialized message whose time and groups of numbers, distinct at first, are replaced."""
+
+    def __init__(self, message: Any, *groups: tuple[float, ...]) -> None:
+        self._data = bytearray(serialize_message(message))
+        packers = [struct.Struct(f'<{len(group)}d') for group in groups]
+        self._parts = [
+            (packer, self._data.index(packer.pack(*group)))
+            for packer, group in zip(packers, groups, strict=True)
+        ]
+
+    def write(self, stamp: bytes, *groups: tuple[float, ...]) -> bytes:
+        """Return the message with a serialized time and other numbers."""
+        self._data[_STAMP] = stamp
+        for (packer, at), group in zip(self._parts, groups, strict=True):
+            packer.pack_into(self._data, at, *group)
+        return bytes(self._data)
+
+    def read(self, data: bytes, group: int = 0) -> tuple[float, ...]:
+        """Return a group of the numbers of a message with the same names and frame."""
+        packer, at = self._parts[group]
+        return packer.unpack_from(data, at)
+
+
+#: Time of the header in a serialized message.
+_STAMP: Final = slice(4, 12)
+
+_FORCE: Final = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+
+
+def _wrench() -> Template:
+    message = WrenchStamped()
+    message.header.frame_id = 'needle_base'
+    force, torque = message.wrench.force, message.wrench.torque
+    force.x, force.y, force.z, torque.x, torque.y, torque.z = _FORCE
+    return Template(message, _FORCE)
+
+
+def _point() -> Template:
+    message = PointStamped()
+    message.header.frame_id = 'needle_entry'
+    message.point.x, message.point.y, message.point.z = 1.0, 2.0, 3.0
+    return Template(message, (1.0, 2.0, 3.0))
+
+
+def _joint_state(*names: str, effort: bool = False) -> Template:
+    count = len(names)
+    groups = [tuple(float(count * k + i + 1) for i in range(count)) for k in range(3)]
+    message = JointState(name=names, position=groups[0], velocity=groups[1])
+    if effort:
+        message.effort = groups[2]
+    return Template(message, *groups[: 2 + effort])
+
+
+class BytesSender:
+    """Publishes samples as `Sender`, as serialized messages."""
+
+    def __init__(self, node: Node) -> None:
+        self._publishers = [node.create_publisher(t, n, SENSOR) for n, t in STREAMS.items()]
+        self._templates = (
+            _wrench(),
+            _point(),
+            _joint_state('d', 'theta', 'q1', 'q2'),
+            _joint_state('insertion', 'rotation', effort=True),
+        )
+
+    def send(self, stamp: int, depth: float = 0.05) -> None:
+        time = struct.pack('<iI', stamp // 1_000_000_000, stamp % 1_000_000_000)
+        wrench, tip, truth, joints = self._templates
+        first, second, third, last = self._publishers
+        first.publish(wrench.write(time, (0.0, 0.5, 0.0, 0.0, 0.0, 0.0)))
+        second.publish(tip.write(time, (0.0, depth, 0.0)))
+        third.publish(truth.write(time, (0.15, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)))
+        last.publish(joints.write(time, (depth, 0.0), (0.0, 0.0), (0.5, 0.0)))
+
+
 class Clocked(Node, ABC):
     """Runs periodically while the topic ``run`` is true, and catches up missed periods."""
 
@@ -141,6 +221,24 @@ class BarePlant(Clocked):
         self._force = message.wrench.force.y
 
 
+class BytesPlant(Clocked):
+    """`BarePlant` with serialized messages."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('bare_plant', **options)
+        self._force, self._template = 0.0, _wrench()
+        self._sender = BytesSender(self)
+        self.create_subscription(
+            WrenchStamped, 'wrench_command', self._on_command, COMMAND, raw=True
+        )
+
+    def sample(self, stamp: int) -> None:
+        self._sender.send(stamp)
+
+    def _on_command(self, data: bytes) -> None:
+        self._force = self._template.read(data)[1]
+
+
 class BareEcho(Node):
     """Responds to each ``joint_states`` with the messages of the controller, the command first."""
 
@@ -177,6 +275,39 @@ class BareEcho(Node):
         self._error.publish(off)
 
 
+class BytesEcho(Node):
+    """`BareEcho` with serialized messages."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('bare_echo', **options)
+        self._command = self.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
+        self._reference = self.create_publisher(JointState, 'reference', SENSOR)
+        self._error = self.create_publisher(JointState, 'tracking_error', SENSOR)
+        self._seen = 0.0
+        self._wrench, self._tip, self._aim = _wrench(), _point(), _joint_state('insertion')
+        self._joints = _joint_state('insertion', 'rotation', effort=True)
+        for kind, topic, take in (
+            (PointStamped, 'tip_deflection', self._on_tip),
+            (WrenchStamped, 'base_wrench', self._on_wrench),
+            (JointState, 'joint_states', self._on_joint_states),
+        ):
+            self.create_subscription(kind, topic, take, SENSOR, raw=True)
+
+    def _on_tip(self, data: bytes) -> None:
+        self._seen = self._tip.read(data)[2]
+
+    def _on_wrench(self, data: bytes) -> None:
+        self._seen = self._wrench.read(data)[2]
+
+    def _on_joint_states(self, data: bytes) -> None:
+        (depth, _), (speed, _) = self._joints.read(data, 0), self._joints.read(data, 1)
+        stamp = data[_STAMP]
+        self._command.publish(self._wrench.write(stamp, (0.0, depth, 0.0, speed, 0.0, 0.0)))
+        aim = self._aim.write(stamp, (depth,), (speed,))
+        self._reference.publish(aim)
+        self._error.publish(aim)
+
+
 class BareSource(Clocked):
     """
     Sends numbered messages of the four plant topics and the command to a recorder.
@@ -210,16 +341,22 @@ class BareSource(Clocked):
             self._command.publish(self._wrench)
 
 
-ROLES: Final = {'plant': BarePlant, 'echo': BareEcho, 'source': BareSource}
-EXECUTORS: Final = {'events': EventsExecutor, 'single': SingleThreadedExecutor}
+#: Nodes by role and kind: message objects, or serialized messages.
+NODES: Final = {
+    'objects': {'plant': BarePlant, 'echo': BareEcho, 'source': BareSource},
+    'bytes': {'plant': BytesPlant, 'echo': BytesEcho},
+}
 
 
-def main(role: str, executor_name: str) -> None:
-    """Run a node of `ROLES` on an executor of `EXECUTORS` until it or its parent ends."""
+def main(role: str, kind: str) -> None:
+    """Run a node of `NODES` on the events executor until it or its parent ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
-    executor: Executor = EXECUTORS[executor_name]()
-    executor.add_node(ROLES[role]())
+    executor: Executor = EventsExecutor()
+    executor.add_node(NODES[kind][role]())
+    # As the nodes of the suite do.
+    gc.collect()
+    gc.freeze()
     while True:
         # In rclpy 7.1 spin of the events executor returns at once, and spin_once at each event.
         executor.spin_until_future_complete(Future(), timeout_sec=0.5)

@@ -24,8 +24,8 @@ Figures: TypeAlias = dict[str, float]
 #: Time of arrival and time stamp of each message [ns], by topic.
 Seen: TypeAlias = Mapping[str, list[tuple[int, int]]]
 
-#: Executors of the pairs of bare nodes, by name.
-_BARE: Final = {'bare': 'events', 'bare, usual executor': 'single'}
+#: Messages of the pairs of bare nodes, by name.
+_BARE: Final = {'bare': 'objects', 'bare, bytes': 'bytes'}
 
 #: Parameters of the plants by name of the pair: the needle of the paper, and a flexible needle.
 _OURS: Final[Mapping[str, dict[str, object]]] = {
@@ -79,7 +79,7 @@ class Pair:
         self.pids: dict[str, int] = {}
         self._kill: dict[str, Callable[[], None]] = {}
         self._bare: list[subprocess.Popen[bytes]] = []
-        self._executor = _BARE.get(name)
+        self._kind = _BARE.get(name)
         self._plant = _OURS.get(name, {})
         self._run = self.node.create_publisher(Bool, 'run', LATCHED)
         self._target = self.node.create_publisher(PointStamped, 'target', COMMAND)
@@ -87,12 +87,12 @@ class Pair:
 
     def start(self, what: str) -> None:
         """Start ``plant`` or ``controller``."""
-        if self._executor is None:
+        if self._kind is None:
             given = self._plant if what == 'plant' else {}
             node = self.graph.start(what, {'autostart': False, **self._parameters, **given})
             self.pids[what], self._kill[what] = node.process.pid, node.kill
         else:
-            bare = self.start_bare(_ROLES[what], self._executor)
+            bare = self.start_bare(_ROLES[what], self._kind)
             self.pids[what], self._kill[what] = bare.pid, partial(self._kill_bare, bare)
 
     def kill(self, what: str) -> None:
@@ -105,10 +105,10 @@ class Pair:
         process.kill()
         process.communicate()
 
-    def start_bare(self, role: str, executor: str = 'events') -> subprocess.Popen[bytes]:
+    def start_bare(self, role: str, kind: str = 'objects') -> subprocess.Popen[bytes]:
         """Start a bare node by `benchmarks.bare.main`; its output is in ``stdout``."""
         process = subprocess.Popen(
-            [sys.executable, '-m', 'benchmarks.bare', role, executor],
+            [sys.executable, '-m', 'benchmarks.bare', role, kind],
             env=self.graph.environment,
             stdout=subprocess.PIPE,
         )
@@ -117,7 +117,7 @@ class Pair:
 
     def ready(self, what: str) -> None:
         """Wait until ``plant`` or ``controller`` is ready."""
-        if self._executor is None:
+        if self._kind is None:
             self.graph.change(self.node, what, CONFIGURE)
             if what == 'controller':
                 self.graph.change(self.node, what, ACTIVATE)
@@ -156,12 +156,12 @@ class Pair:
     @contextmanager
     def running(self) -> Iterator[None]:
         """Run the plant within a ``with`` statement."""
-        if self._executor is None:
+        if self._kind is None:
             self.graph.change(self.node, 'plant', ACTIVATE)
         else:
             self.run_bare(True)
         yield
-        if self._executor is None:
+        if self._kind is None:
             self.graph.change(self.node, 'plant', DEACTIVATE)
         else:
             self.run_bare(False)

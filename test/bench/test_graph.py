@@ -4,17 +4,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from benchmarks import endurance
 from benchmarks import graph as bench_graph
 from benchmarks import pairs as bench_pairs
-from benchmarks.bare import PERIOD, STREAMS
+from benchmarks.bare import BytesSender, PERIOD, Sender, STREAMS
 from benchmarks.graph import GraphPlan
 from benchmarks.measure import Bar
 from benchmarks.page import PageSection
 from benchmarks.pairs import Figures, PAIRS
 from needle_identification import BagWriter
 from needle_identification.bags.messages import encode, message_type
+from needle_insertion.graph.ros_graph import Graph
+from needle_ros.base_node import SENSOR
 import numpy as np
 import pytest
 
@@ -50,6 +53,26 @@ def test_every_node_pair_has_all_metrics(
     assert set(PAIRS) < set(section.heads)
     assert [bar.limit for bar in bars] == [1.3, 1.5, 1.3, 1.5, 1.5, 1.5, 1.5]
     assert all(bar.found > 0.0 and not bar.at_least for bar in bars)
+
+
+def test_bare_nodes_send_equal_samples_as_objects_and_as_bytes(tmp_path: Path) -> None:
+    with Graph(tmp_path) as graph:
+        node = graph.node('samples')
+        received: dict[str, list[Any]] = {name: [] for name in STREAMS}
+        for name, kind in STREAMS.items():
+            node.create_subscription(kind, name, received[name].append, SENSOR)
+        objects, data = Sender(node), BytesSender(node)
+        graph.spin_until(
+            lambda: all(node.count_publishers(name) == 2 for name in STREAMS), 'discovery', 60.0
+        )
+        graph.spin_until(objects.has_readers, 'subscriptions', 60.0)
+        objects.send(12_345_678_901, 0.07)
+        data.send(12_345_678_901, 0.07)
+        graph.spin_until(
+            lambda: all(len(found) == 2 for found in received.values()), 'samples', 60.0
+        )
+    for first, second in received.values():
+        assert first == second
 
 
 def test_recorder_receives_counted_messages(tmp_path: Path) -> None:
