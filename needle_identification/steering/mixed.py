@@ -4,17 +4,18 @@ Likelihood of the tips of a medium in a linear mixed model.
 
 In each plane of each recording, the tip minus its response to the guide is
 
-.. math:: X \beta + o + s d + w(d) + v(g) + e
+.. math:: X \beta + o + s d + w(d) + u(d) + v(g) + e
 
 with the drift constants of the medium :math:`\beta`, which are normal with known deviations, an
 offset o, a slope s ~ N(0, tau^2) with the depth d, the path noise w, an integrated Wiener process
-of intensity q, the error v of the response to the guide g, whose variance grows with its travel,
-and white noise e of deviation sigma. All causes of drift are possible at once; without a prior
-[Harville1977]_ they would not be determined together. The offset and sigma are integrated out. The
-ratios of the other deviations to sigma are summed over a grid: a few recordings hardly determine
-them. A penalty for each ratio integrates the lengths in the response out, in the approximation of
-[Cox1987]_: otherwise the lengths of a few recordings are those with the least difference between
-recordings.
+of intensity q, an error u near the skin, where tissue hardly supports the needle and it yields to
+each load of the tip, the error v of the response to the guide g, whose variance grows with its
+travel, and white noise e of deviation sigma. All causes of drift are possible at once; without a
+prior [Harville1977]_ they would not be determined together. The offset and sigma are integrated
+out. The ratios of the other deviations to sigma are summed over a grid: a few recordings hardly
+determine them. A penalty for each ratio integrates the lengths in the response out, in the
+approximation of [Cox1987]_: otherwise the lengths of a few recordings are those with the least
+difference between recordings.
 
 References
 ----------
@@ -40,6 +41,11 @@ _TRAVEL: Final = 1e-3  # motion of the guide whose response has the deviation of
 _WANDERS: Final = (0.0, 1.0, 4.0, 16.0, 64.0, 256.0)
 _SLOPES: Final = (0.0, 2.0, 8.0, 32.0, 128.0)
 _RESPONSES: Final = (0.0, 0.5, 2.0, 8.0)
+
+#: Grid of the deviation of the error at the skin over that of the path noise.
+_ENTRIES: Final = (0.0, 2.0)
+_SHALLOW: Final = 0.02  # depth over which this error decays [m]
+_CORRELATED: Final = 5e-3  # depth over which it is correlated [m]
 
 _FINEST: Final = 1e-6  # smallest deviation of the white noise [m]
 
@@ -80,7 +86,13 @@ class MixedModel:
         if ratios is None:
             # The drift of a single recording contains its slope.
             slopes = _SLOPES if len(depths) > 1 else (0.0,)
-            ratios = np.array(list(product(_WANDERS, slopes, _RESPONSES)))
+            ratios = np.array(
+                [
+                    (*own, entry * own[0])
+                    for *own, entry in product(_WANDERS, slopes, _RESPONSES, _ENTRIES)
+                    if own[0] or not entry
+                ]
+            )
         self.ratios, self.depths, self.penalties = ratios, depths, penalties
         self.prior = prior
         #: Samples minus offsets.
@@ -153,7 +165,9 @@ def covariance(moved: FloatArray, ratio: FloatArray) -> FloatArray:
     steps = np.diff(moved[:, 1:], axis=0, prepend=moved[:1, 1:])
     travel = np.cumsum(np.hypot(*steps.T)) / _TRAVEL
     response = np.minimum(travel[:, np.newaxis], travel)
-    parts = zip(ratio, (wander, np.outer(d, d), response), strict=True)
+    decay = np.exp(-_REACH * d / _SHALLOW)
+    entry = np.outer(decay, decay) * np.exp(-_REACH * (high - low) / _CORRELATED)
+    parts = zip(ratio, (wander, np.outer(d, d), response, entry), strict=True)
     return np.asarray(np.eye(len(d)) + sum(one**2 * part for one, part in parts))
 
 

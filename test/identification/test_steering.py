@@ -146,6 +146,17 @@ def test_bending_length_is_known_with_several_causes_of_drift(seed: int) -> None
     assert length.interval[0] <= truth.length <= length.interval[1]
 
 
+def test_a_long_free_length_that_yields_at_the_skin_is_known() -> None:
+    """Without an error at the skin the fit was a bending length of 5 mm with large slopes."""
+    truth = drawn(11)
+    assert truth.free > 2.5 * truth.length
+    length = identify_steering([insertion(11000 + k, truth) for k in range(3)])['gel'][
+        'bending_length'
+    ]
+    assert length.determined
+    assert length.interval[0] <= truth.length <= length.interval[1]
+
+
 def test_likelihood_is_that_of_the_joint_normal_distribution() -> None:
     """Of tips with drift of known variance, with any offset, for the best sigma."""
     rng = np.random.default_rng(0)
@@ -166,7 +177,7 @@ def test_likelihood_is_that_of_the_joint_normal_distribution() -> None:
         joint += np.linalg.slogdet(total)[1] + np.linalg.slogdet(normal)[1]
         return found.deviance, float(joint)
 
-    ratios = [(0.0, 0.0, 0.0), (4.0, 0.0, 0.5), (64.0, 8.0, 2.0)]
+    ratios = [(0.0, 0.0, 0.0, 0.0), (4.0, 0.0, 0.5, 8.0), (64.0, 8.0, 2.0, 0.0)]
     differences = [found - joint for found, joint in map(deviances, ratios)]
     # Up to a constant; rounding and the smallest noise of 1 um, of 1 mm.
     assert_allclose(differences, differences[0], atol=1e-4)
