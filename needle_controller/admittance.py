@@ -46,7 +46,9 @@ class Admittance:
         self.position: float | None = None
         self.velocity = 0.0  #: Velocity of the base [m/s].
         self._ahead = lead  #: Least distance of the command from a robot that is less deep [m].
-        self._yields = False  #: Whether the base has given way since its last motion.
+        #: Depth at which the base gives way [m]; None while it moves.
+        self._goal: float | None = None
+        self._stamp: int | None = None  #: Stamp of the last command that may have moved [ns].
         self.answered: int | None = None  #: Stamp of the last step [ns]; None at rest.
         #: States of the last steps; the first one is by the delay of the law before now.
         self._states = deque[BaseState](maxlen=delay + 1)
@@ -66,6 +68,12 @@ class Admittance:
     def _near(self, position: float, measured: float) -> float:
         return min(max(position, measured - self._lead), measured + self._lead)
 
+    def _elapsed(self, last: int | None, stamp: int) -> float:
+        """Return the time to move since a stamp [s]; a period at first."""
+        if last is None:
+            return self._period
+        return min(max((stamp - last) / NANOSECONDS, 0.0), _LONGEST * self._period)
+
     def step(self, force: float, measured: float, stamp: int) -> float:
         """
         Return the depth to command [m] under a force less known loads [N] until the next sample.
@@ -77,11 +85,8 @@ class Admittance:
             before = self._rest(measured)
         if not self._states:
             self._states.append(BaseState(before, self.velocity))
-        elapsed = self._period
-        if self.answered is not None:
-            longest = _LONGEST * self._period
-            elapsed = min(max((stamp - self.answered) / NANOSECONDS, 0.0), longest)
-        self.answered, self._ahead, self._yields = stamp, self._lead, False
+        elapsed = self._elapsed(self.answered, stamp)
+        self.answered, self._ahead, self._goal, self._stamp = stamp, self._lead, None, stamp
         most = self._speed
         aim, velocity = self.axis.propagate(before, self.velocity, force, elapsed)
         velocity = min(max(velocity, -most), most)
@@ -95,9 +100,9 @@ class Admittance:
         self._states.append(BaseState(near, self.velocity, near != within, behind))
         return near
 
-    def place(self, position: float) -> None:
+    def place(self, position: float, stamp: int) -> None:
         """Command a depth [m] at once, within ``lead`` of the measured one."""
-        self.position, self._ahead = position, self._lead
+        self.position, self._ahead, self._goal, self._stamp = position, self._lead, None, stamp
 
     def hold(self, measured: float | None) -> float | None:
         """
@@ -112,13 +117,21 @@ class Admittance:
             self._ahead = 0.0
         if self.position is None or measured is None:
             return None
-        self.position = self._rest(measured)
+        rest = self._rest(measured)
+        if rest != self.position and self._goal is not None:
+            # Something else has moved the needle: it does not return.
+            self._goal = rest
+        self.position = rest
         self._ahead = min(self._ahead, max(self.position - measured, 0.0))
         return self.position
 
-    def give_way(self, measured: float) -> float | None:
-        """Stop the base where it no longer pushes; see `hold`."""
-        if self.position is not None and not self._yields:
-            # Of a withdrawing needle the measured depth is the deeper one.
-            self.position, self._yields = min(measured, self.position), True
+    def give_way(self, measured: float, stamp: int) -> float | None:
+        """Move the base with ``speed`` to where it no longer pushes, and stop; see `hold`."""
+        if self.position is not None:
+            if self._goal is None:
+                # Of a withdrawing needle the measured depth is the deeper one.
+                self._goal = min(measured, self.position)
+            most = self._speed * self._elapsed(self._stamp, stamp)
+            self.position = max(self.position - most, min(self._goal, self.position))
+            self._stamp = max(stamp, self._stamp or stamp)
         return self.hold(measured)

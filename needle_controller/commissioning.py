@@ -49,7 +49,8 @@ class CommissioningSettings:
     tolerance: float = constant(1e-3, 'm', 'tolerance of the measured depths', high=1.5e-3)
     distance: float = constant(5e-4, 'm', 'length of the first motion', low=1e-4, high=1.5e-3)
     speed: float = constant(1e-3, 'm/s', 'its largest speed', low=1e-4, high=5e-3)
-    lag: float = constant(0.08, 's', 'largest delay of a robot that follows positions')
+    #: A robot that has not moved 1 s after its command is blocked, see `ResponseMonitor`.
+    lag: float = constant(0.08, 's', 'largest delay of a robot that follows positions', high=0.8)
 
     def __post_init__(self) -> None:
         check_constants(self)

@@ -310,8 +310,8 @@ class Robot:
 
         ``depth`` is the measured insertion depth [m], None if it is not known: then a robot that
         follows positions gets none, and stays where it is. ``load`` is the load against insertion
-        that the force must overcome [N]. With ``stopped``, a latched stop, the position command is
-        where the robot was measured.
+        that the force must overcome [N]. With ``stopped``, a latched stop, the position command
+        moves to where the robot was measured at the stop, not faster than ``speed``.
         """
         settings = self.settings
         if settings.command == EFFORT:
@@ -325,10 +325,10 @@ class Robot:
                 self._others.clear()
                 length = base.hold(None)
             elif stopped:
-                length = base.give_way(depth)
+                length = base.give_way(depth, answer.stamp)
             elif answer.reference and self.probe is not None:
                 if isfinite(self.probe):
-                    base.place(self.probe)
+                    base.place(self.probe, answer.stamp)
                     length = base.hold(depth)
             elif answer.reference:
                 length = base.step(answer.force - load, depth, answer.stamp)

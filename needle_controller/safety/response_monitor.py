@@ -12,6 +12,7 @@ from needle_ros.timing import NANOSECONDS
 _PATIENCE: Final = NANOSECONDS // 10  #: Time without response until the plant is lost [ns].
 _LONGEST: Final = NANOSECONDS  #: Time without motion of a robot that is behind its command [ns].
 _NOTHING: Final = 0.1  #: Least response, as a fraction of the commanded force or distance.
+_RANGE: Final = 0.5  #: Least range of depths that is a motion, as a fraction of the distance.
 _WINDOW: Final = NANOSECONDS // 5  #: Longest time of a displacement that shows the friction [ns].
 
 #: Friction as a multiple of the nominal one: the strongest, for a stop while the reference moves;
@@ -59,7 +60,13 @@ class StallMonitor:
 
     def _begin(self, depth: float) -> None:
         """Expect motion from a depth [m] on."""
-        self._depth, self._velocity, self._expected = depth, 0.0, 0.0
+        self._velocity = 0.0
+        self._restart(depth)
+
+    def _restart(self, depth: float) -> None:
+        """Compare displacements from a depth [m] on; the expected velocity stays."""
+        self._depth = self._least = self._largest = depth
+        self._expected = 0.0
 
     def change(self, axis: Axis) -> None:
         self.axis = axis
@@ -96,6 +103,7 @@ class StallMonitor:
             self._begin(depth)
             self._mark = None
         self._observe(stamp, depth, (force - load) * elapsed)
+        self._least, self._largest = min(self._least, depth), max(self._largest, depth)
         moved = depth - self._depth
         if rate != 0.0:
             self.relaxed, self._holding = False, 0.0
@@ -123,9 +131,11 @@ class StallMonitor:
         self._expected += (speed if force > 0.0 else -speed) * elapsed
         if abs(self._expected) <= self.most:
             return None
+        # A needle that a load pushes back, and its force forward again, has moved.
+        responds = self._largest - self._least > _RANGE * self.most
         self._expected = 0.0
-        if abs(moved) > _NOTHING * self.most:
-            self._depth = depth
+        if responds or abs(moved) > _NOTHING * self.most:
+            self._restart(depth)
             return None
         if rate == 0.0:
             self.relaxed = True
@@ -191,12 +201,12 @@ class ResponseMonitor:
         commanded and the reported force [N], NaN if there is none, the known load against the
         force [N], the distance [m] to a reference that steps: it rests while the needle moves, and
         whether a robot that follows positions is behind its command, None for another robot. With
-        positions the force is virtual: at rest it moves nothing.
+        positions the force is virtual and precedes the robot by its delay: the robot is compared
+        with its command instead.
         """
         applied = commanded if isnan(reported) else reported
         self.fault = None
-        rests = rate == 0.0 and behind is not None
-        if rests or (step is not None and abs(step) <= self._stall.most):
+        if behind is not None or (step is not None and abs(step) <= self._stall.most):
             self._stall.forget()
         else:
             # Far from a step, the needle must move as behind a moving reference.
@@ -212,7 +222,11 @@ class ResponseMonitor:
         return self.lost
 
     def _check_robot(self, stamp: int, depth: float, *, behind: bool) -> str | None:
-        """Return why a robot that is behind its position command is blocked, or None."""
+        """
+        Return why a robot that is behind its position command is blocked, or None.
+
+        The command stays within ``hardware.lead`` of the measurement, also of a frozen encoder.
+        """
         moved = 0.0 if self._behind is None else abs(depth - self._behind.depth)
         if not behind:
             self._behind = None
@@ -221,7 +235,8 @@ class ResponseMonitor:
         elif stamp - self._behind.stamp > _LONGEST:
             return (
                 f'the robot does not follow its position command: {1e3 * moved:.3g} mm in '
-                f'{_LONGEST / NANOSECONDS:g} s; it is blocked, or its encoders are frozen'
+                f'{_LONGEST / NANOSECONDS:g} s; it is blocked, later than that, or its encoders '
+                'are frozen'
             )
         return None
 

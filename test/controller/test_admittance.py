@@ -98,27 +98,47 @@ def test_hold_and_give_way_stop_the_base() -> None:
     """At its last position, or at the measured position; a repeated stamp moves nothing."""
     base = base_of(lead=1e-3)
     assert base.hold(0.02) is None
-    assert base.give_way(0.02) is None
+    assert base.give_way(0.02, 0) is None
     for k in range(50):
         last = base.step(10.0, 0.02, k * STEP)
     assert last == pytest.approx(0.021)
     assert base.step(10.0, 0.02, base.answered or 0) == last
     assert base.hold(0.02) == last
     assert base.velocity == 0.0
-    assert base.give_way(0.02) == 0.02
+    for k in range(50, 65):
+        last = base.give_way(0.02, k * STEP)
+    assert last == 0.02
 
 
-@given(st.floats(-20.0, 20.0), st.floats(-1e-3, 1e-3))
-def test_base_gives_way_out_of_the_tissue_only(force: float, lag: float) -> None:
-    """A withdrawing robot is deeper than its command, one that advances less deep."""
+@pytest.mark.requirement('S-333')
+@given(
+    force=st.floats(-20.0, 20.0),
+    lag=st.floats(-1e-3, 1e-3),
+    waits=st.lists(st.integers(0, 5 * STEP), min_size=30, max_size=30),
+)
+def test_base_gives_way_with_its_speed_and_out_of_the_tissue(
+    force: float, lag: float, waits: list[int]
+) -> None:
+    """
+    A withdrawing robot is deeper than its command, one that advances less deep.
+
+    Commands in a stop have any times, such as those of the watchdog between two samples.
+    """
     base = base_of(lead=1e-3)
     for k in range(20):
         base.step(force, 0.02 + lag, k * STEP)
-    position = base.position
-    assert position is not None
-    found = base.give_way(0.02 + lag)
-    assert found is not None
-    assert found <= min(position, 0.02 + lag)
+    last, now = base.position, 19 * STEP
+    assert last is not None
+    goal = min(last, 0.02 + lag)
+    for wait in waits:
+        now += wait
+        found = base.give_way(0.02 + lag, now)
+        assert found is not None
+        assert goal <= found <= last
+        assert last - found <= 0.05e-9 * wait + 1e-12
+        last = found
+    if sum(min(wait, 2 * STEP) for wait in waits) > 1.001e-3 / 0.05e-9:
+        assert last == goal
 
 
 LEAD = 1e-3
@@ -139,10 +159,9 @@ def test_base_at_rest_moves_no_needle_that_was_moved(
     base = base_of(lead=LEAD)
     for k in range(20):
         base.step(force, 0.02 + lag, k * STEP)
-    stop = base.give_way if yields else base.hold
     ahead = LEAD
-    for measured in (0.02 + lag, *(0.02 + lag + one for one in moved)):
-        command = stop(measured)
+    for k, measured in enumerate((0.02 + lag, *(0.02 + lag + one for one in moved)), 20):
+        command = base.give_way(measured, k * STEP) if yields else base.hold(measured)
         assert command is not None
         assert -LEAD - CLOSE - 1e-12 <= command - measured <= ahead + CLOSE + 1e-12
         ahead = min(ahead, max(command - measured, 0.0))

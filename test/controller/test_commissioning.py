@@ -350,16 +350,25 @@ def test_invalid_facts_are_rejected_in_one_line(values: dict[str, Any], said: st
 @pytest.mark.parametrize('kind', [Stage, Spindle])
 @pytest.mark.parametrize('frozen', [False, True])
 @pytest.mark.parametrize('speed', [1e-3, 1e-2])
+@pytest.mark.parametrize('dead', [0, 100])
 def test_position_robot_without_motion_stops_the_system(
-    kind: type[SimulatedRobot], speed: float, *, frozen: bool
+    kind: type[SimulatedRobot], speed: float, dead: int, *, frozen: bool
 ) -> None:
-    """Blocked, or with frozen encoders: it is ahead of them by the lead of 2 mm at most."""
+    """
+    Blocked, or with frozen encoders, prompt or late by 0.5 s.
+
+    It is ahead of them by the lead of 2 mm at most, and stopped within a second and its delay.
+    """
     one = correct(kind)
     robot = one.robot()
-    end = robot.depth + 4e-3
+    end, moment = robot.depth + 4e-3, [0.0, 0.0]
 
     class Faulty(kind):  # type: ignore[misc, valid-type]
+        time = 0.0
+
         def move(self, h: float) -> None:
+            self.time += h
+            moment[self.depth >= end] = self.time
             if frozen or self.depth < end:
                 super().move(h)
             else:
@@ -369,9 +378,26 @@ def test_position_robot_without_motion_stops_the_system(
             return float(super().position(min(depth, end) if frozen else depth))
 
     values = {name: getattr(robot, name) for name in SimulatedRobot.__dataclass_fields__}
+    values['dead'] += dead
     session = replace(one, robot=lambda: Faulty(**values))
     limits = ReferenceLimits(speed=speed)
-    found = run(session, check=False, duration=10.0, limits=limits)
-    assert 'encoders' in found.reason
+    found = run(session, check=False, duration=15.0, limits=limits)
+    assert found.reason.startswith('the robot does not follow its position command')
     # The position is constant within noise.
     assert found.motion < 4e-3 + 2e-3 + 1e-4
+    # The session ends 0.5 s after the stop; the first of the needle's motion to the lead.
+    assert moment[1] - moment[0] < 1.0 + 0.2e-3 / speed + dead / RATE + 0.5 + 0.1
+
+
+@pytest.mark.requirement('S-334')
+@pytest.mark.parametrize('kind', [Stage, Spindle])
+@pytest.mark.parametrize(
+    ('lag', 'dead'), [(0.2, 0.1), (0.3, 0.0), (0.02, 0.2), (0.5, 0.2), (0.02, 0.5), (0.02, 0.75)]
+)
+def test_late_position_robot_arrives(kind: type[SimulatedRobot], lag: float, dead: float) -> None:
+    """With any delay that `hardware.commissioning.lag` allows: 0.8 s at most."""
+    late = changed_robot(correct(kind), lag=lag, dead=round(dead * RATE))
+    slow = replace(late, facts={**late.facts, 'lag': 0.8})
+    found = run(slow, check=True, duration=25.0)
+    assert (found.reason, found.phase) == ('', CommissioningPhase.PASSED)
+    assert found.arrived

@@ -254,7 +254,14 @@ def test_position_command_rests_without_a_reference() -> None:
     # A repeated measurement does not stop the motion.
     assert robot.command(ForceCommand(stamp, 10.0), 0.02) == [last]
     assert robot.command(ForceCommand(stamp + 1), 0.02) == [last]
+    # In a stop it moves to the robot with 50 mm/s.
+    for k in range(1, 100):
+        (now,) = robot.command(ForceCommand(stamp + k * 1_000_000), 0.02, stopped=True) or [nan]
+        assert 0.0 <= last - now <= 0.05 + 1e-9
+        last = now
+    assert last == pytest.approx(20.0)
     # Implausible measurements do not change the command.
+    stamp += SECOND
     robot.measurement(state(['insertion'], [1e9], [0.0], stamp=stamp + 2))
     assert robot.command(ForceCommand(stamp + 2), None, stopped=True) is None
     assert robot.command(ForceCommand(stamp + 3), 0.02, stopped=True) == pytest.approx([20.0])

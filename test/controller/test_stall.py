@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from math import nan
 
 from benchmarks.loop import Loop, LoopFault, Sent
+from hypothesis import example, given
+from hypothesis import strategies as st
 from needle_controller.controller import ControllerSettings
 from needle_controller.gains import DEFAULT_GAINS, LAWS
 from needle_controller.laws.sampled import InverseDynamicsGains
@@ -226,3 +228,36 @@ def test_force_against_an_unknown_load_returns() -> None:
     # The encoders freeze, and the force grows.
     assert rest(1.0, depth - 2e-4, 2.0 * force) > 0
     assert monitor.fault is None
+
+
+@pytest.mark.requirement('S-335')
+@given(
+    share=st.floats(-1.1, 1.1),
+    begin=st.floats(0.0, 1.0),
+    force=st.floats(3.0, 10.0),
+    friction=st.floats(0.8, 1.4),
+)
+@example(share=1.0, begin=0.4, force=3.6, friction=1.0)
+def test_needle_that_a_load_displaces_has_moved(
+    share: float, begin: float, force: float, friction: float
+) -> None:
+    """Back by what the force moves it while 1 mm is expected; frozen encoders are still found."""
+    monitor = ResponseMonitor(PHANTOM, ControllerSettings(rate=200.0))
+
+    def speed(factor: float) -> float:
+        return (force / factor - PHANTOM.coulomb_friction) / PHANTOM.viscous_friction
+
+    jump = 1e-3 * share * speed(friction) / speed(1.5)
+    depth, pushed = 0.02, False
+    for k in range(400):
+        depth += speed(friction) / 200.0
+        if not pushed and k / 200.0 > begin:
+            depth, pushed = depth - jump, True
+        monitor.update(k * NANOSECONDS // 200, depth, 0.01, force, nan)
+        assert monitor.fault is None
+    # A force with 1.5 times the nominal friction moves the needle by 2 mm in this time.
+    for k in range(400, 410 + round(2e-3 / speed(1.5) * 200.0)):
+        monitor.update(k * NANOSECONDS // 200, depth, 0.01, force, nan)
+        if monitor.fault is not None:
+            return
+    pytest.fail('the frozen encoders are not found')
