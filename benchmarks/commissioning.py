@@ -224,6 +224,8 @@ class FirstMotionSession(NamedTuple):
     apart: float
     error: float
     arrived: bool
+    #: Result of a first motion that has passed.
+    result: str = ''
 
 
 def run(
@@ -305,6 +307,7 @@ def run(
         apart,
         measured - reported if aimed else 0.0,
         aimed and abs(reported - start - _MOTION) < 5e-4,
+        commissioning.result,
     )
 
 

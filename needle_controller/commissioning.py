@@ -10,8 +10,10 @@ from needle_controller.controller import Controller, ControllerOutput, Measureme
 from needle_controller.hardware import POSITION, Robot
 from needle_controller.laws.law import Axis
 from needle_controller.reference.setpoint import Setpoint
+from needle_controller.safety.input_monitor import MEMORY
 from needle_controller.safety.safety import SafetyLimits
 from needle_controller.safety.timing_monitor import RateMonitor
+from needle_dynamics import FloatArray
 from needle_ros.errors import JobError, ParameterError
 from needle_ros.quantities import AXES
 from needle_ros.settings import check_constants, constant, flag
@@ -32,6 +34,12 @@ _FIRST, _DOUBLING = 1e-5, 0.15
 _WEAKER, _STRONGER = 0.1, 1.5
 #: Number of measurements of a delay, and least change of the force that is a response [N].
 _TRIES, _FELT = 3, 0.05
+#: Standard errors of a mean force, or of an integrated velocity, that are no noise.
+_CERTAIN = 5.0
+#: Time in which a robot rests at the end of its first motion [s].
+_REST = 0.2
+#: Least and largest tolerated contradiction of a velocity, as a fraction of the displacement.
+_EXACT, _COARSE = 0.1, 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,6 +89,7 @@ class Commissioning:
 
     def __post_init__(self) -> None:
         self._time = self._depth = self._settled = nan
+        self._pulled = 0.0, 0.0  #: Times between which the motion needs a force [s].
         self._steps: Generator[float, Measurement, None] | None = None
         if self.settings.enabled:
             self._check_configuration()
@@ -168,11 +177,14 @@ class Commissioning:
         self._require_response(beyond <= self._noise[1], f'at most {-1e3 * most:.3g} mm')
 
     def _require_response(self, condition: bool, command: str) -> None:
+        most = self.settings.distance
         if not condition:
             raise JobError(
-                f'the joint {self.robot.settings.joint!r} moved {1e3 * self._rows[-1][1]:+.3g} mm '
-                f'on a command of {command}: hardware.joint, sign, scale, command, command_topic '
-                'or command_joints, delay, or the driver'
+                f'the joint {self.robot.settings.joint!r} moved '
+                f'{round(1e3 * self._rows[-1][1], 6) + 0.0:+.3g} mm on a command of {command}: '
+                'hardware.joint, sign, scale, command, command_topic or command_joints, delay, '
+                f'the driver, or an encoder with steps above {1e3 * _TOLERANCE * most:.3g} mm, a '
+                'fifth of hardware.commissioning.distance'
             )
 
     def _check_at_rest(self) -> None:
@@ -204,30 +216,61 @@ class Commissioning:
         self._check_at_rest()
         lag = yield from self._by_position() if own.command == POSITION else self._by_force()
         rows = np.array(self._rows)
-        moved, by_velocity = rows[-1, 1], np.diff(rows[:, 0]) @ rows[1:, 2]
-        contradiction = abs(by_velocity - moved) > 0.5 * abs(moved) + self._noise[1]
-        if contradiction and not self.robot.estimates:
+        self._check_velocity(rows)
+        reaction = self._check_force(rows)
+        self.phase = CommissioningPhase.PASSED
+        self.result = f'moved {1e3 * rows[-1, 1]:+.2f} mm, {1e3 * lag:.0f} ms late, {reaction}'
+
+    def _check_velocity(self, rows: FloatArray) -> None:
+        """Compare the integral of the velocity with the displacement."""
+        if self.robot.estimates:
+            return
+        own, steps = self.controller.settings, np.diff(rows[:, 0])
+        moved, by_velocity = rows[-1, 1], steps @ rows[1:, 2]
+        speed, allowed, remedy = self.controller.guide.limits.speed, _COARSE, ''
+        if self.robot.settings.command == POSITION:
+            # A longer motion with the speed of the reference would be interrupted.
+            allowed = min(max(own.jump / (MEMORY * speed), _EXACT), _COARSE)
+            remedy = '; leave the velocity out, it is then estimated, or lower reference.speed'
+        changes = np.abs(np.diff(rows[:, 1]))
+        resolution = np.min(changes[changes > 1e-9], initial=self.settings.distance)
+        noise = _CERTAIN / _SIGMAS * self._noise[2] * np.linalg.norm(steps)
+        tolerance = allowed * abs(moved) + self._noise[1] + resolution + noise
+        if abs(by_velocity - moved) > tolerance:
             raise JobError(
                 f'the position moved {1e3 * moved:.3g} mm, and {1e3 * by_velocity:.3g} mm by its '
-                'velocity: unit of the velocity, or hardware.stamps'
+                f'velocity: unit of the velocity, or hardware.stamps{remedy}'
             )
-        # Largest change of the force, and its axis.
-        change = max(rows[:, 3:], key=np.linalg.norm)
+
+    def _check_force(self, rows: FloatArray) -> str:
+        """Check the direction of the mean force in the motion; return it as text."""
+        if not self._feels():
+            return 'no force measured'
+        own, (begin, end) = self.robot.settings, self._pulled
+        rest, pull = np.array(self._rest)[:, 3:], rows[:, 3:]
+        pull = pull[(begin < rows[:, 0]) & (rows[:, 0] <= end)]
+        half = len(rest) // 2
+        drift = np.abs(np.mean(rest[half:], axis=0) - np.mean(rest[:half], axis=0))
+        error = np.sqrt(1.0 / _readings(rest) + 1.0 / _readings(pull)) * np.std(rest, axis=0)
+        least = np.maximum(_CERTAIN * error + 2.0 * drift, _FELT)
+        change = np.mean(pull, axis=0)
         axis = int(np.argmax(np.abs(change)))
-        pull, reaction = change[axis], 'no force measured'
-        if abs(pull) > max(self._noise[3 + axis], _FELT):
-            reaction = f'force {pull:+.2f} N'
-            if axis != 1 or pull > 0.0:
-                index, sign = own.axes()[axis]
-                wanted = ('-' if sign * pull > 0.0 else '') + AXES[index]
-                other = f', or hardware.reaction to {not own.reaction}'.lower()
-                raise JobError(
-                    f'the force on the needle changed by {pull:+.2f} N along {AXES[axis]} of '
-                    f'needle_base, not -y: set hardware.force_axis to {wanted}'
-                    + (other if axis == 1 else '')
-                )
-        self.phase = CommissioningPhase.PASSED
-        self.result = f'moved {1e3 * moved:+.2f} mm, {1e3 * lag:.0f} ms late, {reaction}'
+        value = change[axis]
+        if abs(value) <= least[axis]:
+            return (
+                f'no force above the noise of {least[axis]:.2g} N measured: hardware.force_axis '
+                'and reaction are not checked'
+            )
+        if axis != 1 or value > 0.0:
+            index, sign = own.axes()[axis]
+            wanted = ('-' if sign * value > 0.0 else '') + AXES[index]
+            other = f', or hardware.reaction to {not own.reaction}'.lower()
+            raise JobError(
+                f'the force on the needle changed by {value:+.2f} N along {AXES[axis]} of '
+                f'needle_base, not -y: set hardware.force_axis to {wanted}'
+                + (other if axis == 1 else '')
+            )
+        return f'force {value:+.2f} N'
 
     def _by_position(self) -> Generator[float, Measurement, float]:
         """Command a ramp; return the delay of the robot [s]."""
@@ -236,7 +279,8 @@ class Commissioning:
         # Long enough to measure the delay.
         duration = max(length / settings.speed, 4.0 * settings.lag + 8.0 * period)
         time = moved = command = 0.0
-        while time < duration or moved - command > _TOLERANCE * length:
+        self._pulled = 0.5 * duration, duration
+        while time < duration + _REST or moved - command > _TOLERANCE * length:
             self._require_response(time < duration + _SETTLING, f'{1e3 * command:.3g} mm')
             self.robot.probe = float(self._zero[1]) + command
             self._add((yield 0.0))
@@ -277,6 +321,7 @@ class Commissioning:
                     'needle is not in the tissue'
                 )
             first, end, fastest = 0.1 * grown, time, abs(velocity)
+            self._pulled = end - _DOUBLING, end
             while abs(velocity) > 0.5 * fastest and time < end + _SETTLING:
                 self._add((yield 0.0))
                 time, _, velocity = self._rows[-1][:3]
@@ -290,3 +335,8 @@ class Commissioning:
             f'the force acts {delay:.3g} periods late, delay is {own.delay}: set delay to '
             f'{delay:.0f}, or lower rate'
         )
+
+
+def _readings(values: FloatArray) -> int:
+    """Return the number of different readings: those of a slow sensor are repeated."""
+    return 1 + int(np.count_nonzero(np.any(np.diff(values, axis=0), axis=1)))

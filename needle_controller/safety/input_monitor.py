@@ -20,7 +20,7 @@ _LIVELY: Final = 10
 
 _ROUNDING: Final = 2  #: Stamps are rounded to nanoseconds [ns].
 
-_MEMORY: Final = 2.0  #: Time over which positions and velocities are compared [s].
+MEMORY: Final = 2.0  #: Time over which positions and velocities are compared [s].
 
 
 class Refusal(NamedTuple):
@@ -202,12 +202,12 @@ class DisplacementMonitor:
                 f'insertion moved by {moved:.6g} m in {elapsed:.6g} s at velocities of '
                 f'{earlier:.6g} and {velocity:.6g} m/s'
             )
-        unexplained = exp(-elapsed / _MEMORY) * self._unexplained + rest
+        unexplained = exp(-elapsed / MEMORY) * self._unexplained + rest
         # Clipped, so that the fault ends as soon as position and velocity agree again.
         self._unexplained = min(max(unexplained, -self._jump), self._jump)
         if abs(unexplained) > self._jump:
             return (
                 f'insertion and its velocity contradict each other: {1e3 * abs(unexplained):.3g} '
-                f'mm too {"much" if unexplained > 0.0 else "little"} within {_MEMORY:g} s'
+                f'mm too {"much" if unexplained > 0.0 else "little"} within {MEMORY:g} s'
             )
         return None

@@ -216,6 +216,42 @@ def test_wrong_reaction_is_refused_with_any_bias_and_delay_of_the_sensor(
     assert run(replace(case, hardware=turned), check=True).phase is CommissioningPhase.PASSED
 
 
+@pytest.mark.requirement('S-191', 'S-336')
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('noise', [0.0, 0.05, 0.15, 0.3])
+@pytest.mark.parametrize('repeats', [1, 4])
+def test_wrong_reaction_is_refused_with_a_noisy_force_sensor(
+    kind: type[SimulatedRobot], noise: float, repeats: int
+) -> None:
+    """Also with one that is slower than the encoders; more noise than force is stated."""
+    one = correct(kind)
+    fixed = one.robot()
+    values = {name: getattr(fixed, name) for name in SimulatedRobot.__dataclass_fields__}
+    values['noise'] = (2e-6, 1e-4, noise)
+
+    class Slow(kind):  # type: ignore[misc, valid-type]
+        count, last = 0, None
+
+        def wrench(self, stamp: int) -> Any:
+            if self.count % repeats == 0:
+                self.last = super().wrench(stamp)
+            self.count += 1
+            return self.last._replace(stamp=stamp)
+
+    noisy = replace(one, robot=lambda: Slow(**values))
+    turned = replace(noisy, hardware={**one.hardware, 'reaction': not one.hardware['reaction']})
+    found = run(noisy, check=True)
+    assert found.phase is CommissioningPhase.PASSED
+    passed = run(turned, check=True)
+    if passed.phase is CommissioningPhase.PASSED:
+        # Efforts end after some samples.
+        assert kind is Slide or repeats * noise > 0.5
+        assert 'hardware.force_axis and reaction are not checked' in passed.result
+    else:
+        assert 'or hardware.reaction to' in passed.reason
+        assert passed.motion <= HARMFUL
+
+
 @pytest.mark.requirement('S-190')
 @pytest.mark.parametrize('kind', KINDS)
 def test_unstated_facts_are_refused_without_motion(kind: type[SimulatedRobot]) -> None:
@@ -270,6 +306,49 @@ def test_velocity_of_another_unit_is_refused(kind: type[SimulatedRobot]) -> None
     found = run(replace(one, robot=lambda: Degrees(**values)), check=True)
     assert found.phase is not CommissioningPhase.PASSED
     assert found.motion <= HARMFUL
+
+
+@pytest.mark.requirement('S-337')
+@pytest.mark.parametrize('share', [0.58, 0.77, 1.0, 1.25])
+@pytest.mark.parametrize('speed', [2e-3, 1e-2])
+def test_velocity_that_would_interrupt_a_motion_is_refused(share: float, speed: float) -> None:
+    """Such as one between two commands; refused if more than 2 mm are missing within 2 s."""
+    one = correct(Spindle)
+    robot = one.robot()
+    values = {name: getattr(robot, name) for name in SimulatedRobot.__dataclass_fields__}
+
+    class Inaccurate(Spindle):
+        def states(self, stamp: int) -> Any:
+            reading = super().states(stamp)
+            positions, velocities, efforts = reading.values
+            scaled = tuple(share * velocity for velocity in velocities)
+            return reading._replace(values=(positions, scaled, efforts))
+
+    limits = ReferenceLimits(speed=speed)
+    session = replace(one, robot=lambda: Inaccurate(**values))
+    found = run(session, check=True, duration=12.0, limits=limits)
+    if abs(share - 1.0) * 2.0 * speed > 2e-3:
+        assert found.phase is CommissioningPhase.REFUSED
+        assert 'leave the velocity out' in found.reason
+    else:
+        assert (found.reason, found.arrived) == ('', True)
+
+
+def test_coarse_encoder_is_named() -> None:
+    """Steps of 1 mm are more than the first motion."""
+    one = correct(Stage)
+    robot = one.robot()
+    values = {name: getattr(robot, name) for name in SimulatedRobot.__dataclass_fields__}
+
+    class Coarse(Stage):
+        def position(self, depth: float) -> float:
+            return super().position(1e-3 * round(depth / 1e-3))
+
+    facts = {**one.facts, 'start_depth': 1e-3 * round(robot.depth / 1e-3)}
+    values['noise'] = (0.0, 0.0, 0.02)
+    found = refused(replace(one, facts=facts, robot=lambda: Coarse(**values)))
+    assert 'a fifth of hardware.commissioning.distance' in found.reason
+    assert 'e-' not in found.reason
 
 
 def test_noise_above_the_motion_is_refused() -> None:
