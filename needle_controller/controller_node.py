@@ -47,7 +47,9 @@ _RETRACT = 'retract_depth'
 #: timeout, and time between them [s].
 _AGAIN, _PAUSE = 5, 0.02
 
-_PATIENCE = 20  #: Checks of the inputs before one that the driver does not publish is reported.
+#: Time before an input that the driver does not publish is reported [s]; DDS announces a node
+#: again after 3 s.
+_PATIENCE = 5.0
 _GUIDE = {joint.name for joint in contract.STEERING_JOINTS}  #: Joints that no axis law controls.
 FEEDBACKS = ('observer', 'ground_truth', 'none')  #: Sources of the load of the bent needle.
 
@@ -147,7 +149,7 @@ class ControllerNode(ModelNode):
         yield from super().preparation()
         # `configure` raises the error of an invalid parameter.
         with suppress(NeedleError):
-            await_topics(self, self.settings('hardware.', HardwareSettings))
+            yield from await_topics(self, self.settings('hardware.', HardwareSettings))
 
     def _connect(self) -> None:
         self._topics = topics = self._driver.topics if self._driver is not None else CONTRACT
@@ -358,9 +360,9 @@ class ControllerNode(ModelNode):
     def _check_driver(self, driver: Driver) -> None:
         """Log why an input was never received, each reason once, after discovery."""
         self._checks += 1
-        if self._checks % _PATIENCE:
-            return
         supervisor, before = self._supervisor, self._missing
+        if self._checks % round(_PATIENCE / supervisor.safety.watch_period):
+            return
         streams = supervisor.safety.streams
         names = [name for name in driver.robot.settings.expected if not streams[name].counts]
         if supervisor.waits:

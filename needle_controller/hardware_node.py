@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS adapter for a robot driver with its own topics and message types."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from time import monotonic, sleep
 from typing import Any, Final, NamedTuple
@@ -16,6 +16,7 @@ from needle_ros import contract
 from needle_ros.base_node import BaseNode, message_class, NEWEST
 from needle_ros.contract import Topic
 from needle_ros.errors import MessageError, ParameterError
+from needle_ros.life_cycle_node import PreparationProgress
 from needle_ros.status import ControllerStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds, set_time
 from needle_ros.wire import Reading
@@ -73,12 +74,16 @@ def _readings(settings: hardware.HardwareSettings) -> tuple[tuple[Topic, str, st
     )
 
 
-def await_topics(node: BaseNode, settings: hardware.HardwareSettings) -> None:
+def await_topics(
+    node: BaseNode, settings: hardware.HardwareSettings
+) -> Iterator[PreparationProgress]:
     """Wait for the discovery of the topics that are found by their type, for a limited time."""
     types = [kind for _, name, kind in _readings(settings) if name == hardware.BY_TYPE]
     deadline = monotonic() + _DISCOVERY
-    while not all(_published(node, one) for one in types) and monotonic() < deadline:
-        sleep(_PAUSE)
+    for kind in types:
+        yield PreparationProgress(0, 0, f'a topic of {kind}, {_DISCOVERY:g} s at most')
+        while not _published(node, kind) and monotonic() < deadline:
+            sleep(_PAUSE)
 
 
 def _published(node: BaseNode, type_name: str) -> list[str]:

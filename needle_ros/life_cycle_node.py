@@ -15,13 +15,19 @@ from rclpy.task import Future
 
 
 class PreparationProgress(NamedTuple):
-    """Progress of a preparation: completed steps, total steps, and name of the next step."""
+    """
+    Progress of a preparation: completed steps, total steps, and name of the next step.
+
+    After all steps it may wait for an event, the name of which is then `step`.
+    """
 
     done: int
     total: int
     step: str
 
     def __str__(self) -> str:
+        if self.done >= self.total:
+            return f'waiting for {self.step}' if self.step else 'prepared'
         return f'preparing {self.done + 1} of {self.total} ({self.step})'
 
 

@@ -4,7 +4,8 @@
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from needle_ros.files import DocumentError, read_document
+from needle_ros.errors import ParameterError
+from needle_ros.files import DocumentError, read_document, read_yaml
 
 MARK: Final = 'ros__parameters'  #: Key of the parameters in a section of a file.
 
@@ -18,6 +19,20 @@ def sections_of(document: Any, namespace: str = '') -> Iterator[tuple[str, Mappi
             yield path, found if isinstance(found, Mapping) else {}
         else:
             yield from sections_of(below, path)
+
+
+def read_sections(path: str) -> list[tuple[str, Mapping[str, Any]]]:
+    """Return the sections of a parameter file; `ParameterError` if it has none."""
+    document = read_yaml(path)
+    if found := list(sections_of(document)):
+        return found
+    keys = [str(name) for name in document] if isinstance(document, Mapping) else []
+    below = document[next(iter(document))] if keys else None
+    keys += [f'{keys[0]}.{name}' for name in below] if isinstance(below, Mapping) else []
+    raise ParameterError(
+        f'{path} has no parameters of a node: a key {MARK!r} below the name of a node is needed, '
+        f'found {", ".join(map(repr, keys[:4])) or "no keys"}'
+    )
 
 
 def parameters_by_node(text: str) -> dict[str, dict[str, Any]]:

@@ -6,13 +6,12 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields
 from itertools import pairwise
-from pathlib import Path
 import re
 from sys import float_info
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from needle_ros.errors import NeedleError, ParameterError
-from needle_ros.parameter_file import MARK, sections_of
+from needle_ros.parameter_file import MARK, read_sections
 from needle_ros.quantities import quantity
 from needle_ros.services_node import ParameterServices
 from needle_ros.settings import check_choice, constraints, from_values, unknown_name
@@ -249,12 +248,12 @@ class ParameterSection(NamedTuple):
 
 
 def sections(arguments: Sequence[str]) -> list[ParameterSection]:
-    """Read the parameter files of a command line that rcl has already parsed."""
+    """Read the parameter files of a command line."""
     files = [file for flag, file in pairwise(arguments) if flag == '--params-file']
     return [
         ParameterSection(file, f'/{name}', frozenset(_flat(values)))
         for file in files
-        for name, values in sections_of(yaml.safe_load(Path(file).read_text(encoding='utf-8')))
+        for name, values in read_sections(file)
     ]
 
 

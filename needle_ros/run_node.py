@@ -8,6 +8,7 @@ import gc
 import inspect
 import os
 from pathlib import Path
+import re
 import signal
 import sys
 import textwrap
@@ -75,7 +76,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
         except (ParameterException, NeedleError, RuntimeError) as error:
             # rcl raises RuntimeError for invalid arguments or parameter files, and for a node that
             # SROS2 rejects.
-            words = ' '.join(str(error).split())
+            words = _explained(error)
             if 'initialize logging' in words:
                 words += '; set ROS_LOG_DIR to a folder that can be written'
             sys.stderr.write(f'error: {words}\n')
@@ -94,6 +95,17 @@ def run(kind: Callable[[], BaseNode]) -> int:
         # A second Ctrl-C must not change the exit status.
         for one in ENDINGS:
             signal.signal(one, signal.SIG_IGN)
+
+
+def _explained(error: Exception) -> str:
+    """Return the message of an error; for a parameter file, what is wrong in it."""
+    if 'parse params file' in str(error):
+        try:
+            sections(sys.argv)
+        except NeedleError as own:
+            error = own
+    # Without the source files of rcl.
+    return re.sub(r' ?, at /\S+:\d+', '', ' '.join(str(error).split()))
 
 
 def _spin(node: BaseNode, stopping: Callable[[], bool]) -> int:

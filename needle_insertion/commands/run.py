@@ -2,6 +2,7 @@
 """`needle run`: start the nodes of an insertion, execute commands of a person or a script."""
 
 import argparse
+from collections.abc import Collection
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,7 @@ def run(options: argparse.Namespace) -> int:
     if not file.is_file():
         raise ParameterError(f'--params-file {file} does not exist')
     nodes = _nodes(options, steers=steers)
+    _check_file(file, ['controller'] if options.hardware else nodes)
     if not options.no_recording:
         nodes = {'recorder': {'path': str(options.output / 'bag')}, **nodes}
     compile_nodes()
@@ -79,6 +81,17 @@ def run(options: argparse.Namespace) -> int:
     if not options.no_recording:
         session.screen.say(f'recorded to {options.output / "bag"}')
     return 0
+
+
+def _check_file(file: Path, nodes: Collection[str]) -> None:
+    """Reject a file without parameters for any of the nodes: they would start with defaults."""
+    # Imported here: rclpy takes a second.
+    from needle_ros.parameter_node import sections, unmatched_files
+
+    found = sections(['--params-file', str(file)])
+    lines = [unmatched_files(found, f'/{name}') for name in nodes]
+    if all(lines):
+        raise ParameterError(lines[0][0])
 
 
 def _plan(options: argparse.Namespace) -> tuple[float, float, float] | None:

@@ -36,6 +36,7 @@ from needle_ros.status import (
 from rclpy.task import Future
 
 _ANSWER: Final = 30.0  #: Timeout of the first status and the first measurements of a node [s].
+_STATED: Final = 2.0  #: Time after which a wait at the start is printed [s].
 #: Settling time of the needle after the end of the reference, and the longest one [s].
 _SETTLING: Final = 1.0
 _LATEST: Final = 5.0
@@ -143,9 +144,22 @@ class Terminal(Cmd):
         for name, topic in _NEEDED:
             if name in nodes:
                 accepted = partial(self._has_accepted, name, topic)
-                self._spin_until(accepted, f'{topic}, an input of {name}', _ANSWER)
-                self._spin_until(self._readings.insertion, 'a measurement', _ANSWER)
+                self._await_robot(accepted, f'{topic}, an input of {name}')
+                self._await_robot(self._readings.insertion, f'a valid measurement on {topic}')
         self._warnings.quiet = 0.0
+
+    def _await_robot(self, condition: Callable[[], Any], what: str) -> None:
+        """Wait for a robot, and print for what and how long."""
+        begin, stated = monotonic(), False
+
+        def holds() -> Any:
+            nonlocal stated
+            if not stated and monotonic() - begin > _STATED:
+                stated = True
+                self._say(f'waiting for {what}, {_ANSWER:g} s at most')
+            return condition()
+
+        self._spin_until(holds, what, _ANSWER)
 
     def _has_accepted(self, node: str, topic: str) -> bool:
         status = self._state(node).report.status

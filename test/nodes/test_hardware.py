@@ -724,3 +724,15 @@ def test_stop_reaches_a_foreign_driver(ros_graph: RosGraph) -> None:
     count = len(bench.commands)
     bench.until(lambda: len(bench.commands) > count + 20, 'more answers')
     assert {*bench.values()[-10:]} == {0.0}
+
+
+def test_preparation_names_the_topic_that_it_waits_for(ros_graph: RosGraph) -> None:
+    """With the longest time; no step has a number above their total."""
+    settings = {**FORCE, 'hardware.wrench_topic': 'auto'}
+    controller = ros_graph.add(ControllerNode, parameters=settings, start=False)
+    lines = [str(one) for one in controller.preparation()]
+    assert lines[-1] == 'waiting for a topic of geometry_msgs/msg/WrenchStamped, 10 s at most'
+    steps = [re.match(r'preparing (\d+) of (\d+) \(.+\)', line) for line in lines]
+    counts = [(int(one[1]), int(one[2])) for one in steps if one]
+    assert counts
+    assert all(step <= total for step, total in counts)

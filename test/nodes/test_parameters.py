@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from math import isfinite
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -115,6 +116,29 @@ def test_numeric_text_is_parsed_as_a_number(ros_graph: RosGraph) -> None:
     node = ros_graph.add(PlantNode, parameters={'model.length': 'long'}, start=False)
     assert not node.start()
     assert 'model.length must be a number, or text with a unit of m' in str(node.failure)
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('plant:\n  ros_parameters:\n    rate: 200.0\n', "found 'plant', 'plant.ros_parameters'"),
+        ('plant:\n  ros__parameters:\n      rate: 1.0\n    law: pid\n', 'line 4, column 5'),
+        ('plant:\n  ros__parameters:\n    rate: [[1.0], [2.0]]\n', 'parse params file'),
+    ],
+)
+def test_invalid_parameter_file_gives_one_line(tmp_path: Path, text: str, said: str) -> None:
+    """Without the source files of the parser."""
+    file = tmp_path / 'plant.yaml'
+    file.write_text(text)
+    found = subprocess.run(
+        [sys.executable, '-m', 'needle_dynamics.plant_node', *arguments(file)],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert found.returncode == 2
+    assert re.fullmatch('error: .*\n', found.stderr)
+    assert str(file) in found.stderr
+    assert said in found.stderr
+    assert '/src/' not in found.stderr
 
 
 @pytest.mark.parametrize(

@@ -278,6 +278,48 @@ def test_first_motion_of_a_robot_is_reported(ros_graph: RosGraph, tmp_path: Path
     assert re.search(refusal, said + complained)
 
 
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('/**/controler:\n  ros__parameters:\n    rate: 200.0', 'no parameters for /controller'),
+        ('/**/plant:\n  ros__parameters:\n    rate: 200.0', 'no parameters for /controller'),
+        ('/**/controller:\n  ros_parameters:\n    rate: 200.0', "found '/**/controller', '"),
+        ('controller:\n  ros__parameters:\n      rate: 200.0\n    law: pid', 'line 4, column 5'),
+        ('', 'found no keys'),
+    ],
+)  # fmt: skip
+def test_parameter_file_without_parameters_ends_before_the_start(
+    ros_graph: RosGraph, tmp_path: Path, text: str, said: str
+) -> None:
+    """Another name of the node, a misspelled key, and a line that is indented too far."""
+    file = tmp_path / 'robot.yaml'
+    file.write_text(text)
+    status, output, complained = told(
+        ros_graph, tmp_path / 'run', [], '--params-file', str(file), '--hardware'
+    )
+    assert (status, output) == (2, '')
+    assert re.fullmatch(f'error: {re.escape(str(file))} .*\n', complained)
+    assert said in complained
+
+
+def test_script_for_another_joint_states_its_wait_and_ends(
+    ros_graph: RosGraph, tmp_path: Path
+) -> None:
+    """With the event, the longest time, and the reason of the controller."""
+    drivers = runpy.run_path(str(ROOT / 'examples/robot_driver.py'), run_name='drivers')
+    ros_graph.add(drivers['PositionRobot'])
+    page = (ROOT / 'docs/howto/own-robot.md').read_text(encoding='utf-8')
+    file = tmp_path / 'robot.yaml'
+    text = page.split('```yaml\n')[1].split('```')[0]
+    file.write_text(text.replace('joint: stage', 'joint: stgae'), encoding='utf-8')
+    words = ['--params-file', str(file), '--hardware', '--no-recording']
+    status, said, complained = told(ros_graph, tmp_path / 'run', ['status'], *words)
+    assert status == 1
+    assert 'waiting for a valid measurement on joint_states, 30 s at most\n' in said
+    assert "joint_states has no position of the joint 'stgae'" in said
+    assert 'error: timeout after 30 s: waiting for a valid measurement on joint' in complained
+
+
 def test_robot_with_own_topic_and_joint(ros_graph: RosGraph, tmp_path: Path) -> None:
     """The position is read with the topic, joint and units of the controller."""
     drivers = runpy.run_path(str(ROOT / 'examples/robot_driver.py'), run_name='drivers')
