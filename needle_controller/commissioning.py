@@ -231,7 +231,9 @@ class Commissioning:
         if self.robot.settings.command == POSITION:
             # A longer motion with the speed of the reference would be interrupted.
             allowed = min(max(own.jump / (MEMORY * speed), _EXACT), _COARSE)
-            remedy = '; leave the velocity out, it is then estimated, or lower reference.speed'
+            remedy = '; leave the velocity out, it is then estimated'
+            if abs(by_velocity - moved) < _COARSE * abs(moved):
+                remedy += ', or lower reference.speed'
         changes = np.abs(np.diff(rows[:, 1]))
         resolution = np.min(changes[changes > 1e-9], initial=self.settings.distance)
         noise = _CERTAIN / _SIGMAS * self._noise[2] * np.linalg.norm(steps)
@@ -338,5 +340,5 @@ class Commissioning:
 
 
 def _readings(values: FloatArray) -> int:
-    """Return the number of different readings: those of a slow sensor are repeated."""
+    """Return the number of different readings; a slow sensor repeats its readings."""
     return 1 + int(np.count_nonzero(np.any(np.diff(values, axis=0), axis=1)))
