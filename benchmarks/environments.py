@@ -23,7 +23,7 @@ MANY: Final = 64
 #: Steps per turn, of a single and of a vector environment: several episodes.
 STEPS: Final = {'single': 1000, 'vector': 100}
 
-_REPEATS: Final = {'default': 10, 'full': 10, 'quick': 1}
+_REPEATS: Final = {'default': 10, 'quick': 1}
 
 
 def steps(environment: Any, actions: list[Any]) -> None:

@@ -4,8 +4,8 @@ Control laws on needles, robots and tissues with unknown parameters.
 
 Each law uses the nominal model `phantom` without a carriage. A cell of the study has its own
 delay, carriage and width of the uniform distributions of mu_s, mu_v and k_a, and a situation: an
-insertion, a withdrawal, a reversal, a membrane puncture, tissue with increasing friction. All laws
-are tested on the same needles.
+insertion, a reversal, a membrane puncture, tissue with increasing friction. All laws are tested on
+the same needles.
 """
 
 from __future__ import annotations
@@ -104,13 +104,12 @@ def _moved(start: float, target: float) -> MinimumJerk:
 
 
 def situations() -> list[Situation]:
-    """Return the situations: five motions of 2 cm and less than 6 s."""
-    into, out = _moved(0.02, 0.04), _moved(0.06, 0.04)
+    """Return the situations: motions of at most 2 cm and less than 6 s."""
+    into = _moved(0.02, 0.04)
     turn = _ThereAndBack(_moved(0.04, 0.05), _moved(0.05, 0.042))
     steady = Trapezoid(Setpoint(0.02), 0.04, ReferenceLimits())
     return [
         Situation('insertion', 0.02, into, into.duration),
-        Situation('withdrawal', 0.06, out, out.duration),
         Situation('reversal', 0.04, turn, turn.duration),
         Situation(
             'puncture, 3 N', 0.02, steady, steady.duration, [(0.028, 3.0, 0.0), (0.03, 0.0, 0.0)]
@@ -153,7 +152,7 @@ class LawCell:
     final, rms : ndarray, shape (needles,)
         Modulus of the final error, and rms error [m].
     beyond : ndarray, shape (needles,)
-        Largest overshoot over the reference, in its direction [m].
+        Largest overshoot over the reference [m].
     cycles, lost : int
         Number of needles with a limit cycle, and with an error above 5 mm.
 
@@ -166,8 +165,8 @@ class LawCell:
     lost: int
 
     @classmethod
-    def of(cls, batch: LoopBatch, goal: FloatArray, direction: float) -> LawCell:
-        """Evaluate runs for a reference (k + 1,) [m] and the sign of its motion."""
+    def of(cls, batch: LoopBatch, goal: FloatArray) -> LawCell:
+        """Evaluate runs for a reference (k + 1,) [m]."""
         lost = (batch.completed < len(goal) - 1) | (batch.largest > _LOST)
         end = batch.depths[:, -round(_END / PERIOD) :]
         steps = np.sign(np.diff(end, axis=1))
@@ -176,7 +175,7 @@ class LawCell:
         return cls(
             final=np.abs(batch.final),
             rms=batch.rms,
-            beyond=np.nanmax(direction * (batch.depths - goal), axis=1),
+            beyond=np.nanmax(batch.depths - goal, axis=1),
             cycles=int(cycles.sum()),
             lost=int(lost.sum()),
         )
@@ -230,7 +229,7 @@ def study(
     goal = np.array(
         [situation.reference.at(k * PERIOD).position for k in range(batch.depths.shape[1])]
     )
-    return LawCell.of(batch, goal, float(np.sign(goal[len(goal) // 4] - goal[0])))
+    return LawCell.of(batch, goal)
 
 
 def compare(tick: Tick, needles: int = 1000) -> Answer:
@@ -243,6 +242,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
     medians, most, over, restless, slower = [], [], [], 0, 0
     default = next(iter(laws()))
     for situation in situations():
+        title = situation.name[0].upper() + situation.name[1:]
         for width in _WIDTHS:
             cells = {}
             for name, law in laws().items():
@@ -250,7 +250,7 @@ def compare(tick: Tick, needles: int = 1000) -> Answer:
                 cells[name] = [study(situation, law, width, *at, needles) for at in grid]
             sections.append(
                 PageSection(
-                    f'{situation.name.capitalize()}, up to {100.0 * width:g} % off',
+                    f'{title}, up to {100.0 * width:g} % off',
                     heads,
                     [[name, *map(str, row)] for name, row in cells.items()],
                 )

@@ -64,8 +64,6 @@ _NOTES: Final = {
     'and their default prior. PPO is trained with {} steps of other needles.',
 }
 
-#: Standard normal quantile of a 95 % interval.
-
 
 class LearningPlan(NamedTuple):
     """Size of the benchmark."""

@@ -21,7 +21,7 @@ EXPERT: Final = 'nominal model'
 #: Gains of proportional policies: action per error in dm.
 GAINS: Final = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 
-_NEEDLES: Final = {'default': 1000, 'full': 1000, 'quick': 20}
+_NEEDLES: Final = {'default': 1000, 'quick': 20}
 
 
 def expert(observations: FloatArray, _running: BoolArray) -> FloatArray:

@@ -80,44 +80,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check = add('commissioning', help='errors in hardware.*, refused by the first motion')
     check.add_argument('--errors', type=int, metavar='N', help='random errors')
     graph = add('graph', help='cost of the nodes compared with bare rclpy nodes')
-    plan = graph.add_mutually_exclusive_group()
-    plan.add_argument(
+    graph_plan = graph.add_mutually_exclusive_group()
+    graph_plan.add_argument(
         '--full',
         dest='plan',
         action='store_const',
         const='full',
         help='record for 60 s and watch the memory for 10 min',
     )
-    plan.add_argument(
-        '--quick',
-        dest='plan',
-        action='store_const',
-        const='quick',
-        help='a trial, too short for reliable figures',
-    )
     slicer = add('slicer', help='the node `slicer` for 10 min, and killed')
-    slicer.add_argument(
-        '--quick', dest='plan', action='store_const', const='quick', help='a trial of 20 s'
-    )
     study = add(
         'study', help='populations of insertions: rates, memory, and workers that are killed'
-    )
-    study.add_argument(
-        '--quick',
-        dest='plan',
-        action='store_const',
-        const='quick',
-        help='a trial, too short for reliable figures',
     )
     pool = add('pool', help='a study whose workers are killed at random times')
     pool.add_argument('--kills', type=int, metavar='N', help='workers that are killed')
     plans = add('plan', help='planners in synthetic anatomies, and their plans in the plant')
     plans.add_argument('--anatomies', type=int, metavar='N', help='number of anatomies')
-    for name, about in (
-        ('environments', 'speed of the Gymnasium environments, and policies without a model'),
-        ('learning', 'laws compared with policies learned by PPO'),
-    ):
-        add(name, help=about).add_argument(
+    environments = add(
+        'environments', help='speed of the Gymnasium environments, and policies without a model'
+    )
+    learning = add('learning', help='laws compared with policies learned by PPO')
+    for trial in (graph_plan, slicer, study, environments, learning):
+        trial.add_argument(
             '--quick',
             dest='plan',
             action='store_const',
