@@ -10,7 +10,7 @@ pose, and the true anatomy by the error of the registration. The law follows the
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from math import ceil, cos, hypot, pi, sin
 from pathlib import Path
@@ -29,8 +29,6 @@ from needle_controller.steering.law import (
     DEFAULT_LAW,
     find_law,
     GuideSetpoint,
-    LawError,
-    SteeringFaultError,
     SteeringLaw,
 )
 from needle_controller.steering.planned_path import PlannedPath
@@ -42,22 +40,12 @@ from needle_controller.steering.settings import (
     SteeringLimits,
     SteeringPrior,
 )
-from needle_controller.steering.simulation import (
-    simulate_steering,
-    SteeringPlant,
-    SteppedTipErrors,
-    SteppedTipSensor,
-)
+from needle_controller.steering.simulation import SteeringPlant, true_needle
 from needle_dynamics.arrays import FloatArray
 from needle_dynamics.needles import find_needle
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.steering.needle import inserted_shape, SteeredNeedle
-from needle_dynamics.steering.parameters import (
-    SteeringParameters,
-    with_bevel,
-    with_layers,
-    with_lengths,
-)
+from needle_dynamics.steering.parameters import SteeringParameters
 from needle_planning.anatomy import Anatomy, SegmentationError, Structure
 from needle_planning.certificate import least_clearances, sag_of, simulate_insertion
 from needle_planning.clearance import Clearance, image_frame
@@ -68,11 +56,10 @@ from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values
 from needle_study import scenario
 from needle_study.scenario import MeasuredRun, Metric, Row, Scenario, Streams, Variable
-from needle_study.steering import SENSOR_ERRORS
+from needle_study.steering import path_seed, steer_sample, steered_variables
 import numpy as np
 
 _PLAN: Final = 'plan.yaml'
-_SEEDS: Final = 2**63  #: Upper bound of the seeds of paths.
 #: Largest distance of the points of the shaft, and of the depths [m]. Between them the shaft
 #: deviates from a bilinear surface by 1 um.
 _SPACING: Final = 5e-3
@@ -222,28 +209,20 @@ class PlanScenario(Scenario):
         )
         count = MOST_LAYERS if self._plan is None else len(self._plan.layers)
         layers, self.absent = LAYERS[:count], absent_layers(count)
-        of_prior, bevel = self._prior, 'load of the bevel beyond the nominal one'
+        bevel = 'load of the bevel beyond the nominal one'
         self.variables: Mapping[str, Variable] = {
-            'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
-            'skin': Variable(
-                1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3
-            ),
+            **steered_variables(self._prior),
             **dict.fromkeys(
                 layers, Variable(1.0, '1', 'stiffness of a layer over its median', 0.01, 100.0)
             ),
             'bevel_x': Variable(0.0, 'N', bevel, -1e3, 1e3),
             'bevel_z': Variable(0.0, 'N', bevel, -1e3, 1e3),
-            'path_noise': Variable(
-                of_prior.path_noise, 'rad^2/m', 'variance of the direction of the path', 0.0
-            ),
             'entry_x': Variable(0.0, 'm', 'position error of the guide', -1.0, 1.0),
             'entry_z': Variable(0.0, 'm', 'position error of the guide', -1.0, 1.0),
             'entry_radius': Variable(0.0, 'm', 'further position error of the guide', 0.0, 1.0),
             'entry_angle': Variable(0.0, 'rad', 'its direction, from x to z', -2 * pi, 2 * pi),
             'frame_x': Variable(0.0, 'rad', 'error of the insertion direction', -0.5, 0.5),
             'frame_z': Variable(0.0, 'rad', 'error of the insertion direction', -0.5, 0.5),
-            'tilt_x': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
-            'tilt_z': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
             **{
                 f'registration_{axis}': Variable(
                     0.0, 'm', 'displacement of the patient against the image', -1.0, 1.0
@@ -262,12 +241,7 @@ class PlanScenario(Scenario):
                 )
                 for axis in 'xyz'
             },
-            'tip_noise': Variable(
-                of_prior.noise, 'm', 'standard deviation of a tip measurement', 0.0
-            ),
-            'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
-            **SENSOR_ERRORS,
-        }  # fmt: skip
+        }
 
     def _sources(self, settings: Mapping[str, Any]) -> tuple[Path, list[str], str]:
         """Return the file of the plan, and segmentations and labels, or the folder of all."""
@@ -348,19 +322,10 @@ class PlanScenario(Scenario):
 
     def _inserted(self, row: Row, rng: np.random.Generator) -> tuple[dict[str, float], FloatArray]:
         """Return the metrics of an insertion, and the shafts in the image, shape (n, k, 3)."""
-        inputs, seed = self._inputs, int(rng.integers(_SEEDS))
-        plant = self._plant(row, seed)
-        errors = SteppedTipErrors(
-            dropout=row['lost'], **{name: row[name] for name in SENSOR_ERRORS}
-        )
-        sensor = SteppedTipSensor(plant, row['tip_noise'], errors, seed, rng, rng)
-        law, stopped = self._law_along(inputs), False
-        try:
-            simulate_steering(law, plant, sensor, limits=self._limits, roll=inputs.plan.roll)
-        except LawError:
-            raise
-        except SteeringFaultError:
-            stopped = True
+        inputs, seed = self._inputs, path_seed(rng)
+        plant, law, roll = self._plant(row, seed), self._law_along(inputs), inputs.plan.roll
+        done = steer_sample(law, plant, row, seed, rng, limits=self._limits, roll=roll)
+        stopped = done is None
         shafts = self._in_image(row, np.stack(plant.shafts))
         least, _ = least_clearances(
             inputs.clearance, shafts, np.zeros((len(shafts) - 1, 1), dtype=np.int64), 1, _TIGHT
@@ -383,19 +348,19 @@ class PlanScenario(Scenario):
         return monitored(law, inputs.model, plan, path, limits, self._contact)
 
     def _plant(self, row: Row, seed: int) -> _PlannedPlant:
-        lengths = row['bending_length'], row['skin']
         inputs = self._inputs
-        needle, steering = with_lengths(inputs.needle, inputs.steering, *lengths)
-        if count := len(inputs.plan.layers):
-            needle = with_layers(needle, [row[name] for name in LAYERS[:count]])
         roll, nominal = inputs.plan.roll, max(inputs.steering.bevel_load)
         x = nominal * sin(roll) + row['bevel_x']
         z = nominal * cos(roll) + row['bevel_z']
         size = hypot(x, z)
-        steering = replace(
-            with_bevel(steering, size),
+        needle, steering = true_needle(
+            inputs.needle,
+            inputs.steering,
+            self._prior,
+            lengths=(row['bending_length'], row['skin']),
+            layers=[row[name] for name in LAYERS[: len(inputs.plan.layers)]],
+            bevel=size,
             path_noise=row['path_noise'],
-            path_noise_length=self._prior.path_noise_length,
         )
         radius, angle = row['entry_radius'], row['entry_angle']
         origin = row['entry_x'] + radius * cos(angle), row['entry_z'] + radius * sin(angle)

@@ -2,7 +2,7 @@
 """Insert sampled needles to a target, steered by a law or in open loop."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from math import nan
 from typing import Any, Final
@@ -16,11 +16,12 @@ from needle_controller.steering.law import (
     find_law,
     LawError,
     SteeringFaultError,
+    SteeringLaw,
 )
 from needle_controller.steering.settings import SIMULATION_LIMITS, SteeringLimits, step_depths
 from needle_dynamics import DEFAULT_NEEDLE, find_needle, insert_batch
 from needle_dynamics.simulated.tip_sensor import TipErrorParameters
-from needle_dynamics.steering.parameters import longest_insertion, with_bevel, with_lengths
+from needle_dynamics.steering.parameters import longest_insertion
 from needle_ros import contract
 from needle_ros.errors import ParameterError
 from needle_ros.settings import constant, from_values, same_field
@@ -35,14 +36,14 @@ _OPEN_LOOP: Final = 'open_loop'
 _SPEED: Final = 0.01  #: insertion speed of a replay [m/s]
 _JOINTS: Final = contract.steered_states(efforts=False)
 _EXACT: Final = simulation.SteppedTipErrors()  # of a sensor with white noise alone
-_SEEDS: Final = 2**63  #: upper bound of the seeds of paths
+_SEEDS: Final = 2**63  # upper bound of the seeds of paths
 _SHORTEST: Final = 1e-6  # lower bound of times and lengths of errors [s, m]
 _OF_BEVEL: Final = 'load of the bevel where it is largest; in other layers in proportion'
 _AT_ONCE: Final = 256  #: insertions per batch, which are in memory together
 _PARTS: Final = ('needle', 'constants', 'prior', 'law')  #: settings that are mappings or words
 
 #: Variables of the errors of the tip sensor beyond white noise and losses.
-SENSOR_ERRORS: Final[Mapping[str, Variable]] = {
+_SENSOR_ERRORS: Final[Mapping[str, Variable]] = {
     item.name: Variable(
         getattr(_EXACT, item.name),
         item.metadata['unit'],
@@ -68,6 +69,54 @@ METRICS: Final[Mapping[str, Metric]] = {
     'expected_z': Metric('m', 'expected final tip position of the law'),
     'covered': Metric('', 'the tip is in the 95 % ellipse of the law'),
 }
+
+
+def steered_variables(prior: SteeringPrior) -> dict[str, Variable]:
+    """Return the variables of a needle and its tip sensor in any steered insertion."""
+    return {
+        'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
+        'skin': Variable(
+            1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3
+        ),
+        'tilt_x': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+        'tilt_z': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+        'path_noise': Variable(
+            prior.path_noise, 'rad^2/m', 'variance of the direction of the path', 0.0
+        ),
+        'tip_noise': Variable(prior.noise, 'm', 'standard deviation of a tip measurement', 0.0),
+        'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
+        **_SENSOR_ERRORS,
+    }
+
+
+def path_seed(rng: np.random.Generator) -> int:
+    """Draw the seed of the noise of a path."""
+    return int(rng.integers(_SEEDS))
+
+
+def steer_sample(
+    law: SteeringLaw,
+    plant: simulation.SteeringPlant,
+    row: Row,
+    seed: int,
+    rng: np.random.Generator,
+    *,
+    limits: SteeringLimits,
+    interval: float = _EXACT.interval,
+    watch: Callable[[simulation.SteeringPlant], object] | None = None,
+    roll: float = 0.0,
+) -> simulation.SteeringRun | None:
+    """Insert a needle with the sensor of a sample; return None if the law stops the insertion."""
+    errors = simulation.SteppedTipErrors(
+        interval=interval, dropout=row['lost'], **{name: row[name] for name in _SENSOR_ERRORS}
+    )
+    sensor = simulation.SteppedTipSensor(plant, row['tip_noise'], errors, seed, rng, rng)
+    try:
+        return simulation.simulate_steering(law, plant, sensor, watch, limits, roll)
+    except LawError:
+        raise
+    except SteeringFaultError:
+        return None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,40 +165,29 @@ class SteeringScenario(Scenario):
                 f'free length, got {numbers.depth:g} m'
             )
         self._depths = step_depths(numbers.depth, numbers.step_length, name='settings.step_length')
-        moves = {
-            DEFAULT_LAW: numbers.guide_limit or numbers.turns,
-            'broyden': numbers.guide_limit,
-            'roll_to_target': numbers.turns,
-        }
-        if not moves.get(self._law, True):
-            raise ParameterError(
-                f'settings: law {self._law} with guide_limit {numbers.guide_limit:g} and turns '
-                f'{numbers.turns:g} has no actuation'
-            )
         bevel, length = max(self._steering.bevel_load), self._needle.length
-        noise = self._prior.path_noise
         self.variables: Mapping[str, Variable] = {
             **dict.fromkeys(
                 ('target_x', 'target_z'),
                 Variable(0.0, 'm', 'lateral position of the target', -length, length),
             ),
-            'bending_length': Variable(1.0, '1', 'bending length over its nominal value', 0.1, 10),
-            'skin': Variable(
-                1.0, '1', 'skin over tissue stiffness, relative to its nominal value', 0.0, 1e3
-            ),
-            'tilt_x': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
-            'tilt_z': Variable(0.0, 'rad', 'tilt of the guide', -0.5, 0.5),
+            **steered_variables(self._prior),
             'bevel_x': Variable(0.0, 'N', _OF_BEVEL, -1e3, 1e3),
             'bevel_z': Variable(bevel, 'N', _OF_BEVEL, -1e3, 1e3),
             'frame_x': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
             'frame_z': Variable(0.0, 'rad', 'rotation of the frame of the sensor', -0.5, 0.5),
-            'path_noise': Variable(noise, 'rad^2/m', 'variance of the direction of the path', 0.0),
-            'tip_noise': Variable(
-                self._prior.noise, 'm', 'standard deviation of a tip measurement', 0.0
-            ),
-            'lost': Variable(0.0, '1', 'fraction of lost tip measurements', 0.0, 1.0),
-            **SENSOR_ERRORS,
         }
+
+    def check(self) -> None:
+        """Raise `ParameterError` if the law cannot be constructed with these limits."""
+        if self._law == _OPEN_LOOP:
+            return
+        try:
+            build_law(self._law, self._model, (0.0, 0.0), self._numbers)
+        except OutOfReachError:  # of this target alone
+            pass
+        except ParameterError as error:
+            raise ParameterError(f'settings: {error}') from error
 
     @cached_property
     def _model(self) -> SteeringModel:
@@ -165,13 +203,14 @@ class SteeringScenario(Scenario):
             yield {**found, 'miss': miss, 'hit': float(miss <= self._numbers.hit_radius)}
 
     def _truth(self, row: Row, rng: np.random.Generator) -> simulation.GroundTruth:
-        lengths = row['bending_length'], row['skin']
-        needle, steering = with_lengths(self._needle, self._steering, *lengths)
         bevel = np.array([row['bevel_x'], row['bevel_z']])
-        steering = replace(
-            with_bevel(steering, float(np.hypot(*bevel))),
+        needle, steering = simulation.true_needle(
+            self._needle,
+            self._steering,
+            self._prior,
+            lengths=(row['bending_length'], row['skin']),
+            bevel=float(np.hypot(*bevel)),
             path_noise=row['path_noise'],
-            path_noise_length=self._prior.path_noise_length,
         )
         return simulation.GroundTruth(
             needle=needle,
@@ -179,7 +218,7 @@ class SteeringScenario(Scenario):
             tilt=(row['tilt_x'], row['tilt_z']),
             bevel=bevel,
             frame=np.array([row['frame_x'], row['frame_z']]),
-            seed=int(rng.integers(_SEEDS)),
+            seed=path_seed(rng),
         )
 
     def _open(self, truths: Sequence[simulation.GroundTruth]) -> Iterable[dict[str, float]]:
@@ -234,17 +273,11 @@ class SteeringScenario(Scenario):
             return {'refused': 1.0}
 
         metrics, plant = {'refused': 0.0, 'stopped': 0.0}, truth.plant(self._depths)
-        errors = simulation.SteppedTipErrors(
-            interval=self._numbers.interval,
-            dropout=row['lost'],
-            **{name: row[name] for name in SENSOR_ERRORS},
+        limits, interval = self._numbers, self._numbers.interval
+        done = steer_sample(
+            law, plant, row, truth.seed, rng, limits=limits, interval=interval, watch=watch
         )
-        sensor = simulation.SteppedTipSensor(plant, row['tip_noise'], errors, truth.seed, rng, rng)
-        try:
-            done = simulation.simulate_steering(law, plant, sensor, watch, self._numbers)
-        except LawError:
-            raise
-        except SteeringFaultError:
+        if done is None:
             return {**metrics, 'stopped': 1.0}
         tip = plant.tip
         metrics |= {

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import hypot
 from time import perf_counter
@@ -48,6 +48,34 @@ class GroundTruth:
         return SteeringPlant(needle, depths, self.frame)
 
 
+def true_needle(
+    needle: NeedleParameters,
+    steering: SteeringParameters,
+    prior: SteeringPrior,
+    *,
+    lengths: Sequence[float],
+    layers: Sequence[float] = (),
+    bevel: float,
+    path_noise: float | None = None,
+) -> tuple[NeedleParameters, SteeringParameters]:
+    """
+    Return a needle that differs from the nominal one.
+
+    ``lengths`` are the factors of bending length and skin, ``layers`` those of the stiffness of
+    each layer. ``bevel`` is the load of the bevel in the layer where it is largest [N], and
+    ``path_noise`` that of the prior unless it is given [rad^2/m].
+    """
+    length, skin = lengths
+    needle, steering = with_lengths(needle, steering, length, skin)
+    if len(layers):
+        needle = with_layers(needle, layers)
+    return needle, replace(
+        with_bevel(steering, bevel),
+        path_noise=prior.path_noise if path_noise is None else path_noise,
+        path_noise_length=prior.path_noise_length,
+    )
+
+
 def sample_truth(
     needle: NeedleParameters,
     steering: SteeringParameters,
@@ -61,18 +89,16 @@ def sample_truth(
     The factors of the layers are log-normal; the sampled load of the bevel acts in the layer with
     the largest nominal load.
     """
-    length, skin = (1.0 + prior.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
+    lengths = (1.0 + prior.spread * rng.uniform(-1.0, 1.0, 2)).tolist()
     sizes = prior.tilt, prior.frame, prior.bevel
     tilt, frame, bevel = (size * rng.standard_normal(2) for size in sizes)
-    needle, steering = with_lengths(needle, steering, length, skin)
+    layers = list[float]()
     if prior.layer_spread:
-        layers = len(needle.tissue.starts)
-        spreads = by_layer('prior.layer_spread', prior.layer_spread, layers)
-        needle = with_layers(needle, np.exp(spreads * rng.standard_normal(layers)).tolist())
-    steering = replace(
-        with_bevel(steering, hypot(*bevel)),
-        path_noise=prior.path_noise,
-        path_noise_length=prior.path_noise_length,
+        count = len(needle.tissue.starts)
+        spreads = by_layer('prior.layer_spread', prior.layer_spread, count)
+        layers = np.exp(spreads * rng.standard_normal(count)).tolist()
+    needle, steering = true_needle(
+        needle, steering, prior, lengths=lengths, layers=layers, bevel=hypot(*bevel)
     )
     x, z = tilt.tolist()
     return GroundTruth(
