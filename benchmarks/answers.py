@@ -18,10 +18,11 @@ from tempfile import TemporaryDirectory
 from time import monotonic
 from typing import Final
 
+from benchmarks.measure import Bar
+from benchmarks.page import PageSection, report
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import GetState
 from needle_insertion.graph.ros_graph import Graph, GraphError
-from needle_insertion.report.content import table
 from needle_ros import contract
 from needle_ros.base_node import COMMAND
 from needle_ros.requests import Verdict
@@ -132,7 +133,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument(
         '--configure', action='store_true', help='of nodes that compile, in place of trajectories'
     )
-    given = parser.parse_args(words)
+    given, begun = parser.parse_args(words), monotonic()
     with TemporaryDirectory() as folder:
         logs = Path(folder)
         if given.configure:
@@ -145,10 +146,9 @@ def main(words: Sequence[str] | None = None) -> int:
         p50, p99, longest = 1e3 * np.percentile(times, [50.0, 99.0, 100.0])
         rows.append((name, str(len(times)), f'{p50:.2f}', f'{p99:.2f}', f'{longest:.2f}'))
         slowest = max(slowest, float(longest))
-    sys.stdout.write(f'{table(rows, ("answer", "count", "p50 ms", "p99 ms", "longest ms"))}\n')
-    state, bar = ('met' if slowest < 1e3 * LONGEST else 'missed'), 1e3 * LONGEST
-    sys.stdout.write(f'{state}: answers within {slowest:.1f} ms, bar {bar:g} ms\n')
-    return int(state == 'missed')
+    heads = 'answer', 'count', 'p50 ms', 'p99 ms', 'longest ms'
+    bar = Bar('longest time to an answer', slowest, 1e3 * LONGEST, 'ms')
+    return report([PageSection('Answers', heads, rows)], [bar], monotonic() - begun)
 
 
 if __name__ == '__main__':

@@ -14,12 +14,14 @@ import os
 from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
+from time import monotonic
 from typing import Final
 
+from benchmarks.measure import Bar
+from benchmarks.page import PageSection, report
 from benchmarks.pairs import Pair
 from geometry_msgs.msg import WrenchStamped
 from needle_insertion.graph.ros_graph import Graph
-from needle_insertion.report.content import table
 from needle_ros.base_node import COMMAND
 from needle_ros.process import set_priority
 import numpy as np
@@ -76,7 +78,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser('benchmarks.gaps', description=__doc__)
     parser.add_argument('--rounds', type=int, default=3, help='number of starts of each kind')
     parser.add_argument('--priority', type=int, default=0, help='priority under SCHED_FIFO')
-    given = parser.parse_args(words)
+    given, begun = parser.parse_args(words), monotonic()
     rows, longest = [], 0.0
     for start in STARTS:
         found = []
@@ -89,10 +91,8 @@ def main(words: Sequence[str] | None = None) -> int:
         if start != 'bare':
             longest = max(longest, *gaps)
     names = ('start', 'p50 ms', 'p99 ms', *(f'longest {k + 1}, ms' for k in range(given.rounds)))
-    sys.stdout.write(f'{table(rows, names)}\n')
-    state, bar = ('met' if longest < 1e3 * LONGEST else 'missed'), 1e3 * LONGEST
-    sys.stdout.write(f'{state}: commands at most {longest:.2f} ms apart, bar {bar:g} ms\n')
-    return int(state == 'missed')
+    bar = Bar('longest time between two commands', longest, 1e3 * LONGEST, 'ms')
+    return report([PageSection('Starts', names, rows)], [bar], monotonic() - begun)
 
 
 if __name__ == '__main__':

@@ -10,6 +10,7 @@ from importlib import metadata
 import os
 from pathlib import Path
 import platform
+import sys
 from typing import Final, TypeAlias
 
 from benchmarks.measure import Bar
@@ -130,3 +131,10 @@ def conclusion(bars: Iterable[Bar], seconds: float) -> str:
         f'The benchmark took {seconds:.0f} s.',
     )
     return f'{section}\n\n{verdict}'
+
+
+def report(sections: Iterable[PageSection], bars: Sequence[Bar], seconds: float) -> int:
+    """Print sections and the end of a page; return the exit status."""
+    for part in (*sections, conclusion(bars, seconds)):
+        sys.stdout.write(f'\n{part}\n')
+    return int(any(bar.missed for bar in bars))

@@ -10,7 +10,6 @@ within 5 s. Run it by ``python -m benchmarks.relay --count 200 --seed 1``.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -20,12 +19,12 @@ from tempfile import TemporaryDirectory
 from time import monotonic
 from typing import Any, Final, NamedTuple
 
+from benchmarks.random_insertions import arguments, at_target, HANGS, PLANT, repeat, STEERING
 from needle_controller.controller_node import ControllerNode
 from needle_controller.steering_node import SteeringNode
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.graph.ros_graph import Graph, GraphError
 from needle_insertion.live.operator import Operator
-from needle_insertion.report.content import table
 from needle_ros import contract
 from needle_ros.base_node import message_class, profile
 from needle_ros.contract import Topic
@@ -34,11 +33,8 @@ from needle_ros.timing import NANOSECONDS
 import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.impl.logging_severity import LoggingSeverity
-from rclpy.logging import set_logger_level
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from tqdm import trange
 
 #: Faults of a message.
 KINDS: Final = ('drop', 'delay', 'duplicate')
@@ -48,45 +44,23 @@ KINDS: Final = ('drop', 'delay', 'duplicate')
 LONGEST_DELAY: Final = 1.0
 LONGEST_STOP: Final = 5.0
 
-#: Timeout of an insertion, in wall time [s].
-_HANGS: Final = 120.0
-
-#: Target x, y, z [m], and largest distance of the tip from it at the end [m].
+#: Target x, y, z [m].
 TARGET: Final = (5e-4, 0.041, -3e-4)
-LARGEST_MISS: Final = 1e-3
+
+#: Ends of an insertion, see `InsertionOutcome`.
+_GOOD: Final = ('target', 'stopped', 'rejected')
+_BAD: Final = ('missed', 'late', 'hangs')
 
 #: Time between two checks for messages to deliver [s].
 _CHECK: Final = 2e-3
 
-_RATE: Final = 200.0
-_PLANT: Final[dict[str, object]] = {
-    'needle': 'bending_35mm',
-    'mode': 'simulation',
-    'steered': True,
-    'lockstep': True,
-    'real_time_factor': 4.0,
-    'rate': _RATE,
-    'depth': 0.001,
-    'model.tissue_stiffness': 5e4,
-    'steering.bevel_load': [0.1],
-    'tip.noise': 1e-4,
-    'guide.speed_limit': 0.1,
-}
-_STEERING: Final[dict[str, object]] = {
-    'needle': 'bending_35mm',
-    'use_sim_time': True,
-    'step_length': 0.01,
-    'speed': 0.05,
-    'guide_speed': 0.05,
-    'acceleration': 0.4,
-    'measurement_time': 0.15,
-    'settle_time': 0.02,
-}
+_PLANT: Final = PLANT | {'mode': 'simulation', 'lockstep': True, 'real_time_factor': 4.0}
+_STEERING: Final = STEERING | {'use_sim_time': True, 'speed': 0.05}
 _CONTROLLER: Final[dict[str, object]] = {
     'needle': 'bending_35mm',
     'use_sim_time': True,
     'steered': True,
-    'rate': _RATE,
+    'rate': PLANT['rate'],
     'deflection_feedback': 'none',
     'reference.speed': 0.05,
     'reference.acceleration': 1.0,
@@ -260,11 +234,6 @@ class InsertionOutcome(NamedTuple):
     counts: Counter[TopicLink]
     struck: bool
 
-    @property
-    def met(self) -> bool:
-        """Whether the insertion reached its target or stopped in time."""
-        return self.end in ('target', 'stopped', 'rejected')
-
 
 def insert(
     fault: MessageFault | None, logs: Path, *, continuous: bool = False
@@ -293,7 +262,7 @@ def insert(
             known = 'steering' in operator.states
             return known and heard and len(accepted) == len(_STATES[::2]) and all(accepted)
 
-        graph.spin_until(ready, 'the nodes', _HANGS)
+        graph.spin_until(ready, 'the nodes', HANGS)
         relay.fault, relay.armed = fault, True
         pending = operator.target(*TARGET)
         loop = steering._loop
@@ -303,24 +272,18 @@ def insert(
             return loop.phase in ends or (pending.done and not pending.outcome[0])
 
         try:
-            graph.spin_until(ended, 'the end', _HANGS)
+            graph.spin_until(ended, 'the end', HANGS)
             end = relay.now
             # A delayed message may still arrive, and must not cause motion.
             later = relay.now + LONGEST_DELAY + 0.5
-            graph.spin_until(lambda: relay.now > later, 'the last message', _HANGS)
+            graph.spin_until(lambda: relay.now > later, 'the last message', HANGS)
         except GraphError as error:
             line = f'{loop.phase.value}; {error}'
             return InsertionOutcome('hangs', line, np.inf, relay.counts, relay.struck is not None)
         struck = relay.struck is not None
         after = end - relay.struck if relay.struck is not None else 0.0
         if loop.phase is SteeringPhase.DONE:
-            x, y, z = np.array(plant._run.plant.insertion.needle.tip)
-            off = float(np.hypot(x - TARGET[0], z - TARGET[2]))
-            there = off < LARGEST_MISS and abs(y - TARGET[1]) < LARGEST_MISS
-            line = f'{1e3 * off:.2f} mm from the target'
-            return InsertionOutcome(
-                'target' if there else 'missed', line, after, relay.counts, struck
-            )
+            return InsertionOutcome(*at_target(plant, TARGET), after, relay.counts, struck)
         if loop.phase is SteeringPhase.STOPPED:
             kind = 'stopped' if after <= LONGEST_STOP else 'late'
             return InsertionOutcome(kind, loop.fault, after, relay.counts, struck)
@@ -338,51 +301,25 @@ def choose(counts: Mapping[TopicLink, int], rng: np.random.Generator) -> Message
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run the insertions, print a table and the verdict; return the exit status."""
-    parser = argparse.ArgumentParser('benchmarks.relay', description=__doc__)
-    parser.add_argument('--count', type=int, default=200, help='number of insertions')
-    parser.add_argument('--seed', type=int, default=1, help='seed of the random choices')
-    given = parser.parse_args(words)
-    # Only outcomes are printed; the log level applies to all nodes with this name in the process.
-    for name in ('plant', 'controller', 'steering'):
-        set_logger_level(name, LoggingSeverity.FATAL)
-    rng, begun = np.random.default_rng(given.seed), monotonic()
-    rows: dict[str, Counter[str]] = {str(link): Counter() for link in LINKS}
-    failed, struck = [], 0
+    count, seed = arguments('benchmarks.relay', str(__doc__), 200, words)
+    # Each link with and without rests.
     with TemporaryDirectory() as folder:
-        # Each link with and without rests.
-        counts = []
-        for continuous in (False, True):
-            clean = insert(None, Path(folder), continuous=continuous)
-            if clean.end != 'target':
-                sys.stdout.write(f'missed: without a fault: {clean.end}, {clean.line}\n')
-                return 1
-            counts.append(clean.counts)
-        for number in trange(given.count, unit=' insertions', disable=None):
-            continuous = bool(number % 2)
-            fault = choose(counts[continuous], rng)
-            outcome = insert(fault, Path(folder), continuous=continuous)
-            rows[str(fault.link)][outcome.end] += 1
-            struck += outcome.struck
-            if outcome.end != 'target':
-                kind = 'continuous' if continuous else 'steps'
-                line = f'{number}: {kind}, {fault}: {outcome.end} after {outcome.after:.2f} s'
-                sys.stdout.write(f'{line}: {outcome.line}\n')
-                sys.stdout.flush()
-            if not outcome.met:
-                failed.append(fault)
-    ends = ('target', 'stopped', 'rejected', 'missed', 'late', 'hangs')
-    lines = [
-        (link, *(str(found[end]) for end in ends)) for link, found in rows.items() if found.total()
-    ]
-    sys.stdout.write(f'{table(lines, ("link", *ends))}\n')
-    reached = sum(found['target'] for found in rows.values())
-    verdict = 'missed' if failed else 'met'
-    sys.stdout.write(
-        f'{verdict}: {given.count} insertions, {struck} with a fault, {reached} at the target, '
-        f'{given.count - reached - len(failed)} stopped in time, {len(failed)} failed; '
-        f'{monotonic() - begun:.0f} s\n'
-    )
-    return int(bool(failed))
+        clean = [insert(None, Path(folder), continuous=one) for one in (False, True)]
+    for one in clean:
+        if one.end != 'target':
+            sys.stdout.write(f'missed: without a fault: {one.end}, {one.line}\n')
+            return 1
+
+    def faulty(number: int, rng: np.random.Generator, logs: Path) -> tuple[str, str, str]:
+        continuous = bool(number % 2)
+        fault = choose(clean[continuous].counts, rng)
+        found = insert(fault, logs, continuous=continuous)
+        kind = 'continuous' if continuous else 'steps'
+        line = f'{kind}, {fault}: {found.end} after {found.after:.2f} s: {found.line}'
+        row = str(fault.link) if found.struck else 'no fault: fewer messages'
+        return row, found.end, '' if found.end == 'target' else line
+
+    return repeat(faulty, _GOOD, _BAD, 'link', count, seed)
 
 
 if __name__ == '__main__':

@@ -11,61 +11,38 @@ Run it by ``python -m benchmarks.restarts --count 50 --seed 1``.
 
 from __future__ import annotations
 
-import argparse
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 import re
 import sys
-from tempfile import TemporaryDirectory
 from time import monotonic
 from typing import Final, NamedTuple
 
+from benchmarks.random_insertions import arguments, at_target, HANGS, PLANT, repeat, STEERING
 from needle_dynamics.plant_node import PlantNode
 from needle_insertion.graph.ros_graph import Graph, GraphError
 from needle_insertion.live.operator import Operator
-from needle_insertion.report.content import table
 from needle_ros import contract
 from needle_ros.base_node import message_class, profile
 from needle_ros.status import NodeStatus, SteeringPhase, SteeringStatus
 import numpy as np
-from rclpy.impl.logging_severity import LoggingSeverity
-from rclpy.logging import set_logger_level
 from rclpy.parameter import Parameter
-from tqdm import trange
 
-#: Target x, y, z [m], and largest distance of the tip from it at the end [m].
+#: Target x, y, z [m].
 TARGET: Final = (1.5e-3, 0.051, -1e-3)
-LARGEST_MISS: Final = 1e-3
+
+#: Ends of an interrupted insertion, see `RestartOutcome`.
+_GOOD: Final = ('target', 'named')
+_BAD: Final = ('missed', 'stopped', 'moved', 'hangs')
 
 #: Latest time of the kill, after the first motion [s]: the insertion takes about 6 s.
 LATEST: Final = 6.0
 
-#: Timeout of an event [s], and displacement of a joint at rest [m].
-_HANGS: Final = 120.0
+#: Displacement of a joint at rest [m].
 _STILL: Final = 1e-6
 
-_PLANT: Final[dict[str, object]] = {
-    'needle': 'bending_35mm',
-    'mode': 'robot',
-    'steered': True,
-    'rate': 200.0,
-    'depth': 0.001,
-    'model.tissue_stiffness': 5e4,
-    'steering.bevel_load': [0.1],
-    'tip.noise': 1e-4,
-    'guide.speed_limit': 0.1,
-}
-_STEERING: Final[dict[str, object]] = {
-    'needle': 'bending_35mm',
-    'step_length': 0.01,
-    'speed': 0.02,
-    'guide_speed': 0.05,
-    'acceleration': 0.4,
-    'measurement_time': 0.15,
-    'settle_time': 0.02,
-    'measurement_timeout': 5.0,
-}
+_PLANT: Final = PLANT | {'mode': 'robot'}
+_STEERING: Final = STEERING | {'speed': 0.02, 'measurement_timeout': 5.0}
 
 #: Actions in the line of a rejected target, as docs/steering.md and docs/safety.md document them.
 _ACTION: Final = re.compile(
@@ -92,11 +69,6 @@ class RestartOutcome(NamedTuple):
     end: str
     phase: str
     line: str
-
-    @property
-    def met(self) -> bool:
-        """Whether the insertion reached its target, or the node named an action."""
-        return self.end in ('target', 'named')
 
 
 class InterruptedInsertion:
@@ -144,11 +116,11 @@ class InterruptedInsertion:
         """Interrupt the insertion, and resume it."""
         graph, operator = self._graph, self._operator
         node = graph.start('steering', _STEERING)
-        graph.spin_until(self._is_ready, 'the measurements', _HANGS)
+        graph.spin_until(self._is_ready, 'the measurements', HANGS)
         operator.target(*TARGET)
-        graph.spin_until(lambda: self._moves, 'the first motion', _HANGS)
+        graph.spin_until(lambda: self._moves, 'the first motion', HANGS)
         end = monotonic() + after
-        graph.spin_until(lambda: monotonic() > end, 'the time of the kill', _HANGS)
+        graph.spin_until(lambda: monotonic() > end, 'the time of the kill', HANGS)
         status = self._status()
         phase = '' if status is None else status.phase.value
         node.kill()
@@ -156,10 +128,10 @@ class InterruptedInsertion:
         self._await_rest()
         before = self._moves
         graph.start('steering', _STEERING)
-        graph.spin_until(self._is_ready, 'the measurements after the restart', _HANGS)
+        graph.spin_until(self._is_ready, 'the measurements after the restart', HANGS)
         # Two periods of the diagnostics without a request.
         end = monotonic() + 2.0
-        graph.spin_until(lambda: monotonic() > end, 'two seconds', _HANGS)
+        graph.spin_until(lambda: monotonic() > end, 'two seconds', HANGS)
         if self._moves > before:
             return RestartOutcome('moved', phase, 'a motion without a request')
         return self._resume(phase)
@@ -175,7 +147,7 @@ class InterruptedInsertion:
                 last, since = now, monotonic()
             return monotonic() > since + 0.5
 
-        self._graph.spin_until(rests, 'rest', _HANGS)
+        self._graph.spin_until(rests, 'rest', HANGS)
 
     def _resume(self, phase: str) -> RestartOutcome:
         """Send the target again, and wait for the end."""
@@ -188,17 +160,15 @@ class InterruptedInsertion:
             phases = (SteeringPhase.DONE, SteeringPhase.STOPPED)
             return pending.done and status is not None and status.phase in phases
 
-        self._graph.spin_until(ended, 'the end', _HANGS)
+        self._graph.spin_until(ended, 'the end', HANGS)
         success, line = pending.outcome
         if not success:
             return RestartOutcome('named' if names_action(line) else 'stopped', phase, line)
         status = self._status()
         if status is not None and status.phase is SteeringPhase.STOPPED:
             return RestartOutcome('stopped', phase, status.fault)
-        x, y, z = np.array(self._plant._run.plant.insertion.needle.tip)
-        off = float(np.linalg.norm(np.array([x, y, z]) - TARGET))
-        kind = 'target' if off < LARGEST_MISS else 'missed'
-        return RestartOutcome(kind, phase, f'{1e3 * off:.2f} mm from the target')
+        end, line = at_target(self._plant, TARGET)
+        return RestartOutcome(end, phase, line)
 
 
 def names_action(line: str) -> bool:
@@ -217,37 +187,14 @@ def interrupt(after: float, logs: Path) -> RestartOutcome:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run the insertions, print a table and the verdict; return the exit status."""
-    parser = argparse.ArgumentParser('benchmarks.restarts', description=__doc__)
-    parser.add_argument('--count', type=int, default=50, help='number of insertions')
-    parser.add_argument('--seed', type=int, default=1, help='seed of the times of the kills')
-    given = parser.parse_args(words)
-    # Only outcomes are printed.
-    set_logger_level('plant', LoggingSeverity.FATAL)
-    rng, begun = np.random.default_rng(given.seed), monotonic()
-    rows: dict[str, Counter[str]] = {}
-    failed = 0
-    with TemporaryDirectory() as folder:
-        for number in trange(given.count, unit=' insertions', disable=None):
-            after = float(rng.uniform(0.0, LATEST))
-            outcome = interrupt(after, Path(folder) / str(number))
-            rows.setdefault(outcome.phase, Counter())[outcome.end] += 1
-            failed += not outcome.met
-            sys.stdout.write(
-                f'{number}: killed after {after:.2f} s, {outcome.phase}: {outcome.end}, '
-                f'{outcome.line}\n'
-            )
-            sys.stdout.flush()
-    ends = ('target', 'named', 'missed', 'stopped', 'moved', 'hangs')
-    lines = [(phase, *(str(found[end]) for end in ends)) for phase, found in rows.items()]
-    sys.stdout.write(f'{table(lines, ("killed while", *ends))}\n')
-    reached = sum(found['target'] for found in rows.values())
-    verdict = 'missed' if failed else 'met'
-    sys.stdout.write(
-        f'{verdict}: {given.count} kills, {reached} at the target, '
-        f'{given.count - reached - failed} with a named action, {failed} failed; '
-        f'{monotonic() - begun:.0f} s\n'
-    )
-    return int(bool(failed))
+    count, seed = arguments('benchmarks.restarts', str(__doc__), 50, words)
+
+    def killed(_number: int, rng: np.random.Generator, logs: Path) -> tuple[str, str, str]:
+        after = float(rng.uniform(0.0, LATEST))
+        end, phase, line = interrupt(after, logs)
+        return phase, end, f'killed after {after:.2f} s, {phase}: {end}, {line}'
+
+    return repeat(killed, _GOOD, _BAD, 'killed while', count, seed)
 
 
 if __name__ == '__main__':

@@ -140,16 +140,9 @@ def find_plan(
 
     """
     every = [anatomy] if isinstance(anatomy, Anatomy) else list(anatomy)
+    limits = limits or SteeringLimits()
     planner = _Planner(
-        every,
-        target,
-        entry,
-        entry_radius,
-        needle,
-        limits or SteeringLimits(),
-        roll,
-        skin_limit,
-        resolution,
+        every, target, entry, entry_radius, needle, limits, roll, skin_limit, resolution
     )
     return planner.plan(bow, progress or (lambda _: None))
 

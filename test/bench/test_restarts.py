@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from benchmarks.random_insertions import repeat
 from benchmarks.restarts import names_action
 import pytest
 
@@ -22,3 +23,23 @@ import pytest
 def test_only_documented_lines_name_an_action(line: str, named: bool) -> None:
     """A line that only mentions a sent message or a wait is a failure."""
     assert names_action(line) is named
+
+
+@pytest.mark.parametrize('end', ['target', 'hangs'])
+def test_status_is_that_of_the_worst_end(end: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each insertion is a cell of the table, and one bad end misses the bar."""
+    ends = iter(['target', end])
+    status = repeat(
+        lambda number, _rng, _logs: ('moving', next(ends), f'number {number}'),
+        ('target',),
+        ('hangs',),
+        'killed while',
+        2,
+        1,
+    )
+    said = capsys.readouterr().out
+    good = 2 - (end == 'hangs')
+    assert f'| moving       | {good}      | {2 - good}     |' in said
+    assert '1: number 1\n' in said
+    assert status == (end == 'hangs')
+    assert said.splitlines()[-1].startswith('missed' if status else 'met')
