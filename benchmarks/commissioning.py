@@ -111,7 +111,8 @@ def _changed(one: RobotSetup, **values: Any) -> RobotSetup:
     return replace(one, hardware={**one.hardware, **values})
 
 
-def _of_robot(one: RobotSetup, **values: Any) -> RobotSetup:
+def changed_robot(one: RobotSetup, **values: Any) -> RobotSetup:
+    """Return the same configuration for another robot."""
     return replace(one, robot=lambda: replace(one.robot(), **values))
 
 
@@ -148,13 +149,13 @@ def _lost_zero(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     # The encoder has another zero than at the time of the measurement.
     robot = one.robot()
     off = float(rng.choice([-1.0, 1.0]) * rng.uniform(2e-3, 0.1))
-    return _of_robot(one, zero=robot.zero + off / robot.gain)
+    return changed_robot(one, zero=robot.zero + off / robot.gain)
 
 
 def _joint(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     robot = one.robot()
     near = robot.position(robot.depth + float(rng.uniform(-0.02, 0.02)))
-    return _changed(_of_robot(one, other=near), joint=OTHER)
+    return _changed(changed_robot(one, other=near), joint=OTHER)
 
 
 def _rate(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
@@ -164,8 +165,8 @@ def _rate(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
 def _delay(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:
     robot = one.robot()
     if isinstance(robot, Slide):
-        return _of_robot(one, dead=int(rng.integers(4, 12)))
-    return _of_robot(one, lag=float(rng.uniform(0.1, 0.3)), dead=int(rng.integers(5, 20)))
+        return changed_robot(one, dead=int(rng.integers(4, 12)))
+    return changed_robot(one, lag=float(rng.uniform(0.1, 0.3)), dead=int(rng.integers(5, 20)))
 
 
 def _force_axis(one: RobotSetup, rng: np.random.Generator) -> RobotSetup:

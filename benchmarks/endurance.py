@@ -126,6 +126,28 @@ def watch_memory(folder: Path, duration: float, tick: Tick) -> Answer:
     return memory_growth(names, rows, duration, GROWTH)
 
 
+def _warm_up(duration: float) -> float:
+    return min(_WARM_UP, 0.1 * duration)
+
+
+def warm_memory(rows: Sequence[tuple[float, Sequence[int]]], duration: float) -> Any:
+    """
+    Return the memory of each node after the warm-up [MB], shape (n, nodes).
+
+    Rows have a time [s] and the resident memory of each node [bytes]; the first tenth of the
+    duration [s], at most a minute, is warm-up.
+    """
+    warm = _warm_up(duration)
+    return np.array([values for at, values in rows if at >= warm or at == rows[-1][0]]) / 1e6
+
+
+def level(memory: Any, share: float) -> Any:
+    """Return the median over a tenth that ends at a fraction of the time after the warm-up."""
+    tenth = max(1, len(memory) // 10)
+    end = tenth + round(share * (len(memory) - tenth))
+    return np.median(memory[end - tenth : end], axis=0)
+
+
 def memory_growth(
     names: Sequence[str],
     rows: Sequence[tuple[float, Sequence[int]]],
@@ -135,25 +157,16 @@ def memory_growth(
     """
     Evaluate rows of a time [s] and the resident memory of each node [bytes].
 
-    The first tenth of the duration [s], at most a minute, is warm-up; `limit` is in MB.
+    `limit` is in MB.
     """
-    warm = min(_WARM_UP, 0.1 * duration)
-    memory = np.array([values for at, values in rows if at >= warm or at == rows[-1][0]]) / 1e6
-    tenth = max(1, len(memory) // 10)
-
-    def around(share: float) -> Any:
-        """Return the median over a tenth that ends at a fraction of the time after the warm-up."""
-        end = tenth + round(share * (len(memory) - tenth))
-        return np.median(memory[end - tenth : end], axis=0)
-
-    shown = [around(share) for share in _SHOWN]
-    growth = around(1.0) - around(0.0)
-    columns = [around(0.0), *shown, growth]
+    memory = warm_memory(rows, duration)
+    growth = level(memory, 1.0) - level(memory, 0.0)
+    columns = [level(memory, 0.0), *(level(memory, share) for share in _SHOWN), growth]
     section = PageSection(
         'Memory',
         ('[MB]', 'warm', *(f'{100 * share:.0f} %' for share in _SHOWN), 'growth'),
         [(name, *(f'{c[k]:.2f}' for c in columns)) for k, name in enumerate(names)],
-        f'Resident memory over {duration:g} s, of which {warm:g} s are warm-up.',
+        f'Resident memory over {duration:g} s, of which {_warm_up(duration):g} s are warm-up.',
     )
     worst = int(np.argmax(growth))
     figure = f'growth of memory in {duration:g} s, largest: {names[worst]}'

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 import time
 from typing import Any, Final
 
-from benchmarks.endurance import GROWTH, resident_memory
+from benchmarks.endurance import GROWTH, level, resident_memory, warm_memory
 from benchmarks.igtl_peer import free_port, Peer, SENT, Told
 from benchmarks.measure import Bar, number
 from benchmarks.page import Answer, PageSection, Tick
@@ -58,7 +58,7 @@ def compare(tick: Tick, plan: str = 'default') -> Answer:
 
 def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
     arrived: list[tuple[float, float]] = []
-    memory: list[float] = []
+    memory: list[tuple[float, list[int]]] = []
     port = free_port()
     with Graph(folder / 'logs') as graph:
         watch = graph.node('watch')
@@ -75,7 +75,7 @@ def _watch(folder: Path, duration: float, tick: Tick) -> Answer:
             begin, spent = time.monotonic(), cpu_seconds(node.process.pid)
             while (now := time.monotonic()) < begin + duration:
                 tick(f'watch, {now - begin:.0f} of {duration:.0f} s')
-                memory.append(resident_memory(node.process.pid) / 1e6)
+                memory.append((now - begin, [resident_memory(node.process.pid)]))
                 end = now + 1.0
                 graph.spin_until(lambda end=end: time.monotonic() > end, 'a second')  # type: ignore[misc]
             share = 100.0 * (cpu_seconds(node.process.pid) - spent) / (time.monotonic() - begin)
@@ -132,7 +132,7 @@ def _answer(
     duration: float,
     shapes: list[Told],
     delays: list[float],
-    memory: list[float],
+    memory: list[tuple[float, list[int]]],
     share: float,
     again: tuple[float, float],
 ) -> Answer:
@@ -143,10 +143,8 @@ def _answer(
     width = round(_RATE * min(_WINDOW, 0.5 * duration))
     windows = width / (stamps[width:] - stamps[:-width])
     rate = (len(stamps) - 1) / (stamps[-1] - stamps[0])
-    tenth = max(1, len(memory) // 10)
-    # The first tenth, at most a minute, is warm-up.
-    warm = memory[min(tenth, 60) :]
-    early, late = np.median(warm[:tenth]), np.median(warm[-tenth:])
+    warm = warm_memory(memory, duration)
+    (early,), (late,) = level(warm, 0.0), level(warm, 1.0)
     rows = [
         ('shapes', f'{len(shapes)}'),
         ('shapes per second by their stamps [Hz]', f'{rate:.3f}'),

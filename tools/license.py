@@ -43,25 +43,25 @@ _PATTERNS: Final = (
 )  # fmt: skip
 
 
-def license_line(ending: str = '.py', root: Path = ROOT) -> str:
+def license_line(ending: str = '.py') -> str:
     """Return the line with the license of package.xml, for a file with this ending."""
-    name = ET.parse(root / 'package.xml').findtext('license')  # noqa: S314
+    name = ET.parse(ROOT / 'package.xml').findtext('license')  # noqa: S314
     before, after = COMMENTS.get(ending, ('# ', ''))
     return f'{before}SPDX-License-Identifier: {name}{after}\n'
 
 
-def sources(root: Path = ROOT) -> Iterator[Path]:
+def sources() -> Iterator[Path]:
     """Yield the tracked source files."""
     listed = subprocess.run(
         ['git', 'ls-files', '-z', *_PATTERNS],  # noqa: S607
-        cwd=root,
+        cwd=ROOT,
         capture_output=True,
         text=True,
         check=True,
     )
     for name in listed.stdout.split('\0'):
         if name and not name.startswith(EXCLUDED):
-            yield root / name
+            yield ROOT / name
 
 
 def licensed(text: str, line: str) -> str:

@@ -246,9 +246,9 @@ def _result(result: Mapping[str, str] | None) -> str:
     return 'not run' if result is None else f'{result["outcome"]} {result["date"]}'
 
 
-def last_results(root: Path = ROOT) -> dict[str, dict[str, str]]:
+def last_results() -> dict[str, dict[str, str]]:
     """Return outcome and date of the last run of each test with a requirement."""
-    path = root / '.pytest_cache' / 'v' / RESULTS
+    path = ROOT / '.pytest_cache' / 'v' / RESULTS
     return json.loads(path.read_text('utf-8')) if path.exists() else {}
 
 

@@ -77,19 +77,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_needle(parser, DEFAULT_NEEDLE)
     limits = SteeringLimits()
     for name, unit, meaning, value in (
-        ('--step', 'm', 'longest step of the insertion (default 5mm)', limits.step_length),
-        ('--limit', 'm', 'largest displacement of the guide along x and z (default 6mm)',
-         limits.guide_limit),
-        ('--guide-step', 'm', 'largest motion of the guide in a step (default 2mm)',
-         limits.guide_step),
-        ('--load-limit', 'N', 'largest lateral force on the guide (default 8N)',
-         limits.load_limit),
-        ('--skin-limit', 'm', 'largest displacement of the needle at the skin (default 2mm)',
-         SKIN_LIMIT),
-        ('--roll', 'rad', 'roll of the needle (default 0)', 0.0),
-        ('--resolution', 'm', 'resolution of the search (default 0.5mm)', RESOLUTION),
-    ):  # fmt: skip
-        common.add_quantity(parser, name, unit, meaning, value)
+        ('--step', 'm', 'longest step of the insertion', limits.step_length),
+        ('--limit', 'm', 'largest displacement of the guide along x and z', limits.guide_limit),
+        ('--guide-step', 'm', 'largest motion of the guide in a step', limits.guide_step),
+        ('--load-limit', 'N', 'largest lateral force on the guide', limits.load_limit),
+        ('--skin-limit', 'm', 'largest displacement of the needle at the skin', SKIN_LIMIT),
+        ('--roll', 'rad', 'roll of the needle', 0.0),
+        ('--resolution', 'm', 'resolution of the search', RESOLUTION),
+    ):
+        shown = f'{1e3 * value:g}mm' if unit == 'm' else f'{value:g}{unit}'
+        common.add_quantity(parser, name, unit, f'{meaning} (default {shown})', value)
     common.add_flag(parser, '--straight', 'plan a straight needle only')
     parser.add_argument(
         '--insertions',

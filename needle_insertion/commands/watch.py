@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from needle_controller.steering.insertion_plan import Plan, read_plan
 from needle_insertion.commands.common import add_flag, add_quantity, add_time, print_each
+from needle_insertion.watch import HOST, PORT
 from needle_ros.errors import ParameterError
 from needle_ros.process import ENDINGS
 from needle_ros.settings import checked
@@ -20,9 +21,6 @@ from needle_ros.settings import checked
 if TYPE_CHECKING:
     # Takes long to import.
     from needle_insertion.watch.server import Server
-
-#: Default address and port, as in `watch.server`, which takes long to import.
-HOST, PORT = '127.0.0.1', 8642
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

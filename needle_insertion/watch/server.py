@@ -32,10 +32,9 @@ from aiohttp import web, WSCloseCode, WSMessage, WSMsgType
 from aiohttp.http import HttpProcessingError
 from needle_insertion.live.requests import REQUESTS
 from needle_insertion.report.page import TEMPLATE_FOLDER
+from needle_insertion.watch import HOST, PORT
 from needle_ros.errors import JobError, NeedleError, ParameterError, printable, shown
 from needle_ros.settings import is_number
-
-PORT: Final = 8642  #: default port
 
 #: Largest number of readers, and of bytes in a message of a reader.
 MOST_READERS: Final = 16
@@ -111,7 +110,7 @@ class Server:
     def __init__(
         self,
         readers: Callable[[], FrameReader],
-        host: str = '127.0.0.1',
+        host: str = HOST,
         port: int = PORT,
         control: Control | None = None,
         anatomy: str = 'null',
@@ -120,7 +119,7 @@ class Server:
             self._local = ip_address(host).is_loopback
         except ValueError:
             raise ParameterError(
-                f'--host must be an address such as 127.0.0.1 or 0.0.0.0, got {host!r}'
+                f'--host must be an address such as {HOST} or 0.0.0.0, got {host!r}'
             ) from None
         if control is not None and not self._local:
             raise ParameterError(

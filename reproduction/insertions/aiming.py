@@ -19,6 +19,7 @@ from needle_insertion.report.insertion import draw_needle, evenly
 from needle_insertion.report.page import Animation
 from needle_insertion.watch.recorded import ShownRecording
 from needle_ros.base_node import COMMAND
+from needle_ros.quantities import NORMAL
 from needle_ros.status import SteeringPhase, SteeringStatus
 from needle_ros.timing import NANOSECONDS, nanoseconds
 import numpy as np
@@ -74,8 +75,6 @@ _FRAMES: Final = 80  #: Number of frames in the animation.
 
 #: Timeout of the insertion, and of the answer to a target, in simulated time [s].
 _LONGEST, _ANSWER = 180.0, 2.0
-
-_NORMAL: Final = 1.96  #: Half-width of a 95 % interval over the standard deviation.
 
 
 def record_aimed(
@@ -134,7 +133,7 @@ class Aimed:
     @property
     def interval_text(self) -> str:
         """Text of the expected tip position with its 95 % interval."""
-        half = _NORMAL * np.sqrt(np.diag(self.covariance))
+        half = NORMAL * np.sqrt(np.diag(self.covariance))
         return ', '.join(
             f'{name} = {1e3 * at:.2f} ± {1e3 * wide:.2f} mm'
             for name, at, wide in zip('xz', self.expected, half, strict=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 from benchmarks.commissioning import (
     cases,
+    changed_robot,
     ErrorCase,
     ERRORS,
     FirstMotionSession,
@@ -37,11 +38,6 @@ _LONG = 16.0
 def correct(kind: type[SimulatedRobot], seed: int = 3) -> RobotSetup:
     """Return a robot with its correct configuration."""
     return setup(kind, np.random.default_rng(seed))
-
-
-def changed_robot(one: RobotSetup, **values: Any) -> RobotSetup:
-    """Return the same configuration for another robot."""
-    return replace(one, robot=lambda: replace(one.robot(), **values))
 
 
 def refused(one: RobotSetup) -> FirstMotionSession:

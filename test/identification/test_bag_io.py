@@ -29,6 +29,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 from support.samples import (
     EPOCH,
+    grid,
     joint_states,
     MOTION,
     simulated,
@@ -76,14 +77,6 @@ def small_bag(
             at = EPOCH + stamp * MILLISECOND
             writer.write('/joints', joint_states(at, depth, velocity, joint_names), at)
     return path
-
-
-def grid(
-    count: int = 11, step: int = 10
-) -> tuple[list[tuple[int, float]], list[tuple[int, float, float]]]:
-    return [(i * step, float(i)) for i in range(count)], [
-        (i * step, 0.1 + 0.001 * i, 0.1) for i in range(count)
-    ]
 
 
 # Round trip.

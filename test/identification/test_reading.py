@@ -24,7 +24,18 @@ from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
-from support.samples import EPOCH, header, joint_states, MOTION, STORE, TEXT, text, WRENCH, wrench
+from support.samples import (
+    EPOCH,
+    grid,
+    header,
+    joint_states,
+    MOTION,
+    STORE,
+    TEXT,
+    text,
+    WRENCH,
+    wrench,
+)
 
 MILLISECOND = 1_000_000
 POSE = 'geometry_msgs/msg/PoseStamped'
@@ -113,14 +124,6 @@ def small_bag(
 
 def forces(count: int = 11, step: int = 10) -> tuple[str, list[tuple[int, bytes]]]:
     return WRENCH, [(i * step, wrench(at(i * step), float(i))) for i in range(count)]
-
-
-def grid(
-    count: int = 11, step: int = 10
-) -> tuple[list[tuple[int, float]], list[tuple[int, float, float]]]:
-    return [(i * step, float(i)) for i in range(count)], [
-        (i * step, 0.1 + 0.001 * i, 0.1) for i in range(count)
-    ]
 
 
 # Selection of force and motion.

@@ -18,7 +18,7 @@ from needle_controller.controller_node import ControllerNode
 from needle_dynamics.plant_node import PlantNode
 from needle_ros.base_node import COMMAND, SENSOR
 from needle_ros.event_log import Severity
-from needle_ros.status import ControllerPhase, ControllerStatus, InputStatus
+from needle_ros.status import ControllerPhase, ControllerStatus
 from needle_ros.system_state import Mode
 import pytest
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
@@ -31,14 +31,14 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from std_srvs.srv._set_bool import SetBool_Request, SetBool_Response
 from std_srvs.srv._trigger import Trigger_Request, Trigger_Response
-from support.ros_graph import RosGraph
+from support.ros_graph import ControllerBench, GraphBench, RosGraph
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 #: Both nodes in the thread of the test.
 SLOW = {'rate': 200.0}
 
 
-class Bench:
+class Bench(ControllerBench):
     """A controller, and a probe in place of the plant."""
 
     def __init__(self, graph: RosGraph, start: Any = True, **parameters: Any) -> None:
@@ -114,15 +114,6 @@ class Bench:
     def said(self) -> str:
         """Return the first diagnostics message."""
         return self.controller.diagnose().message
-
-    @property
-    def status(self) -> ControllerStatus:
-        """Latest status of the controller."""
-        return self.controller.diagnose().status
-
-    def input(self, topic: str) -> InputStatus:
-        """Return the status of an input."""
-        return self.status.input.get(topic, InputStatus())
 
     def wrench(
         self,
@@ -340,7 +331,7 @@ def test_failed_configure_is_undone(ros_graph: RosGraph) -> None:
     assert '/ground_truth' not in [one.topic_name for one in controller.subscriptions]
 
 
-class Loop:
+class Loop(GraphBench):
     """
     Controller and simulated plant in one thread, with a probe.
 
@@ -384,9 +375,6 @@ class Loop:
         )
         self.until(lambda: self.aims and self.targets.get_subscription_count(), 'discovery')
         self.until(self.paths.get_subscription_count, 'discovery')
-
-    def until(self, condition: Callable[..., Any], what: str) -> None:
-        self.graph.spin_until(condition, what)
 
     def aim(self, depth: float) -> None:
         message = PointStamped()

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fault injection in a graph: each fault is reported and leads to zero force."""
 
-from collections.abc import Callable
 from pathlib import Path
 import re
 import resource
@@ -23,7 +22,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from std_srvs.srv._trigger import Trigger_Response
-from support.ros_graph import RosGraph
+from support.ros_graph import ControllerBench, RosGraph
 
 RATE, START, TARGET = 200.0, 0.02, 0.025
 
@@ -34,7 +33,7 @@ NEAR = 2e-4
 REST = 1e-9
 
 
-class Loop:
+class Loop(ControllerBench):
     """
     Plant and controller in this process, and a probe.
 
@@ -59,15 +58,6 @@ class Loop:
             ControllerNode, parameters={'rate': RATE, 'use_sim_time': True, **(controller or {})}
         )
         self.until(lambda: self.status.latency.answered > 5 and self.truth.message, 'discovery')
-
-    def until(self, condition: Callable[..., Any], what: str) -> None:
-        """Spin until a condition holds."""
-        self.graph.spin_until(condition, what)
-
-    @property
-    def status(self) -> ControllerStatus:
-        """Latest status of the controller."""
-        return self.controller.diagnose().status
 
     @property
     def depth(self) -> Any:

@@ -19,7 +19,7 @@ from typing import Any
 from geometry_msgs.msg import PointStamped, WrenchStamped
 from needle_controller.controller_node import ControllerNode
 from needle_ros.base_node import COMMAND, SENSOR
-from needle_ros.status import CommissioningPhase, ControllerStatus, InputStatus
+from needle_ros.status import CommissioningPhase
 from needle_ros.system_state import Mode
 import pytest
 from rclpy.context import Context
@@ -29,7 +29,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from support.installed import ROOT
-from support.ros_graph import RosGraph
+from support.ros_graph import ControllerBench, RosGraph
 from trajectory_msgs.msg import JointTrajectory
 import yaml
 
@@ -69,7 +69,7 @@ POSITION = {
 ROBOTS = {'force': (FORCE, 'ForceRobot'), 'position': (POSITION, 'PositionRobot')}
 
 
-class Bench:
+class Bench(ControllerBench):
     """A robot of examples/robot_driver.py, a controller, and a user."""
 
     def __init__(self, graph: RosGraph, which: str = 'force', **parameters: Any) -> None:
@@ -109,15 +109,6 @@ class Bench:
             return condition()
 
         self.graph.spin_until(holds, what)
-
-    @property
-    def status(self) -> ControllerStatus:
-        """Latest status of the controller."""
-        return self.controller.diagnose().status
-
-    def input(self, topic: str) -> InputStatus:
-        """Return the status of an input."""
-        return self.status.input.get(topic, InputStatus())
 
     def taken(self, topic: str) -> int:
         """Return the number of accepted messages of a topic."""

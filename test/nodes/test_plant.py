@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The plant node in the graph."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 import signal
@@ -32,7 +31,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 from std_srvs.srv._trigger import Trigger_Response
-from support.ros_graph import RosGraph
+from support.ros_graph import GraphBench, RosGraph, stamp_ns
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 import yaml
 
@@ -43,11 +42,6 @@ RATE = {'rate': 200.0}
 COMPLETE = {**RATE, 'publish_clock': True}
 
 NOISE = ForceSensorParameters().per_axis('noise')[:3]
-
-
-def stamp_ns(message: Any) -> int:
-    """Return the stamp of a message [ns]."""
-    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
 def wrench(force: float) -> WrenchStamped:
@@ -69,7 +63,7 @@ def trajectory(
     return message
 
 
-class Bench:
+class Bench(GraphBench):
     """A plant in this process, with a probe that subscribes and commands."""
 
     def __init__(self, ros_graph: RosGraph, **parameters: Any) -> None:
@@ -93,9 +87,6 @@ class Bench:
             ),
             'discovery',
         )
-
-    def until(self, condition: Callable[..., Any], what: str) -> None:
-        self.graph.spin_until(condition, what)
 
     def further(self, count: int) -> list[WrenchStamped]:
         """Spin until a number of additional force readings; return them."""

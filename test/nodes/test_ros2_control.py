@@ -10,7 +10,7 @@ NaN for unset commands.
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from math import nan
@@ -38,7 +38,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from support.generated_messages import importable
 from support.installed import ROOT
-from support.ros_graph import RosGraph
+from support.ros_graph import GraphBench, RosGraph
 import yaml
 
 CONTROLLERS = yaml.safe_load((ROOT / 'config/ros2_control.yaml').read_text(encoding='utf-8'))
@@ -51,7 +51,7 @@ GUIDE = ('guide_x', 'guide_z', 'guide_tilt_x', 'guide_tilt_z', 'roll')
 STEERED: dict[str, Any] = {'steered': True, 'needle': 'bending_35mm', 'depth': 0.02}
 
 
-class Driver:
+class Driver(GraphBench):
     """Publishes controller commands at its own rate, and keeps the latest joint states."""
 
     def __init__(
@@ -115,9 +115,6 @@ class Driver:
     def said(self) -> str:
         """Return the log of the plant."""
         return (self.logs / 'plant.log').read_text(encoding='utf-8')
-
-    def until(self, condition: Callable[[], Any], what: str) -> None:
-        self.graph.spin_until(condition, what)
 
     @property
     def refused(self) -> int:

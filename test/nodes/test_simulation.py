@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Simulation features of the plant: pause, step, reset, lockstep, command stamps, faults."""
 
-from collections.abc import Callable
 from time import sleep
-from typing import Any
 
 from builtin_interfaces.msg import Duration
 from builtin_interfaces.msg._time import Time
@@ -20,7 +18,7 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
-from support.ros_graph import RosGraph
+from support.ros_graph import GraphBench, RosGraph, stamp_ns
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from visualization_msgs.msg import Marker
 
@@ -28,12 +26,7 @@ RATE = {'rate': 200.0}
 PERIOD = 5_000_000
 
 
-def stamp_ns(message: PoseArray | JointState | Marker) -> int:
-    """Return the stamp of a message [ns]."""
-    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-
-
-class Bench:
+class Bench(GraphBench):
     """A plant in this process, with a probe that subscribes, commands and calls services."""
 
     def __init__(self, ros_graph: RosGraph, **parameters: bool | float | str) -> None:
@@ -72,10 +65,6 @@ class Bench:
             message.header.stamp = stamp
         message.wrench.force.y = force
         self.commands.publish(message)
-
-    def until(self, condition: Callable[..., Any], what: str) -> None:
-        """Spin until a condition holds."""
-        self.graph.spin_until(condition, what)
 
     def further(self, count: int) -> list[JointState]:
         """Spin until a number of additional samples; return them."""

@@ -7,9 +7,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
+from needle_controller.controller_node import ControllerNode
 from needle_insertion.graph.ros_graph import Graph
 from needle_ros.base_node import BaseNode
-from needle_ros.status import NodeStatus, read_reports
+from needle_ros.status import ControllerStatus, InputStatus, NodeStatus, read_reports
+from needle_ros.timing import nanoseconds
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -60,3 +62,33 @@ class RosGraph(Graph):
 
         node.create_subscription(DiagnosticArray, '/diagnostics', take, qos)
         return received
+
+
+class GraphBench:
+    """Nodes of a test in a graph."""
+
+    graph: RosGraph
+
+    def until(self, condition: Callable[..., Any], what: str) -> None:
+        """Spin until a condition holds."""
+        self.graph.spin_until(condition, what)
+
+
+class ControllerBench(GraphBench):
+    """Controller and other nodes of a test in a graph."""
+
+    controller: ControllerNode
+
+    @property
+    def status(self) -> ControllerStatus:
+        """Latest status of the controller."""
+        return self.controller.diagnose().status
+
+    def input(self, topic: str) -> InputStatus:
+        """Return the status of an input."""
+        return self.status.input.get(topic, InputStatus())
+
+
+def stamp_ns(message: Any) -> int:
+    """Return the stamp of a message [ns]."""
+    return nanoseconds(message.header.stamp)

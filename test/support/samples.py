@@ -118,3 +118,12 @@ def write_bag(path: Path, recording: Recording, configuration: str = '') -> None
             bag.write('/wrench_command', wrench(stamp, 0.0), stamp)
             bag.write('/joint_states', joint_states(stamp, depth, velocity), stamp)
             bag.write('/ground_truth', joint_states(stamp, 0.0, 0.0), stamp)
+
+
+def grid(
+    count: int = 11, step: int = 10
+) -> tuple[list[tuple[int, float]], list[tuple[int, float, float]]]:
+    """Return forces, and depths with velocities, with times at equal steps [ns]."""
+    return [(i * step, float(i)) for i in range(count)], [
+        (i * step, 0.1 + 0.001 * i, 0.1) for i in range(count)
+    ]
