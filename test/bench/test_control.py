@@ -4,7 +4,7 @@
 from itertools import pairwise
 
 from benchmarks import control as bench_control
-from benchmarks.control import NumpyInverseDynamics, PERIOD
+from benchmarks.control import FloatInverseDynamics, NumpyInverseDynamics, PERIOD
 from needle_controller import InverseDynamicsGains, Setpoint
 from needle_controller.laws.law import SampledLoop
 from needle_dynamics import NeedleParameters
@@ -16,16 +16,21 @@ from reproduction.mismatch import sampled_laws
 PHANTOM = NeedleParameters.preset('phantom')
 
 
-def test_numpy_law_equals_package_law() -> None:
-    plain = NumpyInverseDynamics(PHANTOM, InverseDynamicsGains())
+@pytest.mark.parametrize('program', ['NumPy', 'floats'])
+def test_compared_law_equals_package_law(program: str) -> None:
+    kind = NumpyInverseDynamics if program == 'NumPy' else FloatInverseDynamics
+    plain = kind(PHANTOM, InverseDynamicsGains())
     law = sampled_laws(PHANTOM, PERIOD)['paper_inverse_dynamics']
     ours = SampledLoop(law, bench_control.DELAY, 15.0)
     for k, (before, depth) in enumerate(pairwise(np.linspace(0.1, 0.101, 101))):
         speed, target = (depth - before) / PERIOD, depth + 1e-5
         expected = ours.command(depth, speed, Setpoint(target, 0.01))
-        found = plain.command(depth, speed, np.array([target, 0.01, 0.0]))
+        if isinstance(plain, NumpyInverseDynamics):
+            found = plain.command(depth, speed, np.array([target, 0.01, 0.0]))
+        else:
+            found = plain.command(depth, speed, target, 0.01, 0.0)
         if k == 0:
-            # The NumPy law has no pending command at the start: friction stops no needle.
+            # The compared law has no pending command at the start: friction stops no needle.
             plain.last = expected
             continue
         assert_allclose(found, expected, rtol=1e-9)

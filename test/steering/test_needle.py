@@ -250,12 +250,15 @@ def test_agrees_with_finite_elements_solved_by_scipy(skin: float) -> None:
         steering = SteeringParameters(skin_stiffness=skin, bevel_load=(0.1,), element=h)
         one = SteeredNeedle(parameters, steering, tilt=(0.0, 0.02))
         # The tilt, and the bevel's load on the free length.
-        other = HermiteNeedle(parameters, 0.02, skin, h, 4e-4 + 0.1 * 0.02**3 / (3.0 * EI))
-        for k in range(1, round(0.1 / h) + 1):
+        steps, entry = round(0.1 / h), [0.0, 4e-4 + 0.1 * 0.02**3 / (3.0 * EI)]
+        other = HermiteNeedle(parameters, 0.02, skin, h, steps, entry)
+        for k in range(1, steps + 1):
             guide = 3e-3 * np.sin(60.0 * k * h)
             one.move(depth=k * h, guide=(0.0, guide))
-            shape = other.advance(guide, 0.02, 0.1)
-        errors.append(abs(one.tip[2] - shape[-1, 0]))
+            shape = other.advance([0.0, guide], [0.0, 0.02], [0.0, 0.1])
+        errors.append(abs(one.tip[2] - shape[-1, 0, 1]))
+        # Without a load, a plane is straight.
+        assert not shape[:, :, 0].any()
     # Straight path segments are of first order; both converge to the same tip.
     assert errors[1] < 0.6 * errors[0] < 1e-5
 
