@@ -63,7 +63,7 @@ def friction_columns(
     vectors = [_vector(table, specs[role]) or [specs[role]] for role in roles]
     tried = [{**specs, **dict(zip(roles, names, strict=True))} for names in product(*vectors)]
     if len(tried) == 1:
-        return dict(specs)
+        return tried[0]
     found = []
     for one in tried:
         read = _read(table, one, one)

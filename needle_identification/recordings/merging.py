@@ -14,10 +14,10 @@ stamps stay unchanged.
 
 from typing import Final
 
-from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
+from needle_dynamics.arrays import FloatArray, IntArray
 from needle_identification.errors import RecordingError
 from needle_identification.recordings.recording import Recording
-from needle_identification.recordings.samples import are_gaps, SampleOrigin, Samples
+from needle_identification.recordings.samples import are_covered, SampleOrigin, Samples
 import numpy as np
 
 #: Largest plausible difference of the latencies of two topics [s]. Optical trackers and imagers
@@ -60,7 +60,7 @@ def merge(
     if loss:
         bag.losses.append(loss)
     stamps = force.stamps - offset
-    covered = _covered(stamps, motion.stamps)
+    covered = are_covered(stamps, motion.stamps)
     if np.count_nonzero(covered) < 2:
         raise RecordingError(
             f'{bag.path}: {force.topic} and {motion.topic} do not overlap in time; they last '
@@ -113,10 +113,3 @@ def _drift(force: Samples, motion: Samples) -> list[str]:
         return []
     words = f'by the receive times the clock of {force.topic} gains {1e-6 * growth:.1f} ms on that'
     return [f'{words} of {motion.topic}, not corrected; time receive would correct it']
-
-
-def _covered(stamps: IntArray, motion: IntArray) -> BoolArray:
-    steps = np.diff(motion)
-    after = np.clip(np.searchsorted(motion, stamps), 1, len(steps))
-    inside = (motion[0] <= stamps) & (stamps <= motion[-1])
-    return np.asarray(inside & ~are_gaps(steps)[after - 1])

@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray
+from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.bags.bag import Bag, TABLES
 from needle_identification.bags.topics import BagTopic
 from needle_identification.errors import RecordingError
@@ -47,8 +47,8 @@ _WRENCH: Final = Wanted('wrench_topic', (wire.WRENCH,), (BASE_WRENCH.name,))
 TIP: Final = Wanted('tip_topic', (wire.POINT, wire.POSE), (TIP_DEFLECTION.name,))
 _POSES: Final = (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE)
 _USUAL: Final = (END_EFFECTOR_POSE.name, JOINT_STATES.name)
-#: Spans of positions of an insertion and of presses above which they are rarely in m.
-LONGEST_STROKE, _DEEPEST_PRESS = 2.0, 0.5
+#: Spans of positions of an insertion, and under the force of presses, that are rarely in m.
+LONGEST_STROKE, _DEEPEST_PRESS = 2.0, 0.25
 _FRICTION_MOTION: Final = Wanted('motion_topic', MOTIONS, _USUAL[::-1])
 _INDENTATION_MOTION: Final = Wanted('motion_topic', _POSES, _USUAL)
 
@@ -207,7 +207,7 @@ def read_indentation_recording(
     )
     length = float(sizes.max())
     if length == 1.0:
-        for axis, position in zip(plane, positions.T, strict=False):
+        for axis, position in zip(plane, positions[_are_pressed(forces)].T, strict=False):
             bag.losses += _too_long(motion, position, _DEEPEST_PRESS, '--axes', axis)
     return IndentationRecording(
         name=str(path),
@@ -255,6 +255,12 @@ def _plane(
     if len(set(plane)) != 2:
         raise ParameterError(f'{name} must be two different axes of x, y, z, got {axes!r}')
     return np.array(signs), plane, np.array(sizes)
+
+
+def _are_pressed(forces: FloatArray) -> BoolArray:
+    """Return where a force (n, 2) is far from its median: not on the way to the presses."""
+    size = np.linalg.norm(forces - np.median(forces, axis=0), axis=1)
+    return np.asarray(size > 0.5 * size.max())
 
 
 def _too_long(

@@ -3,6 +3,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence, Set
+from itertools import pairwise
 from math import inf
 from typing import Final, NamedTuple, NoReturn, Protocol
 
@@ -18,10 +19,13 @@ import numpy as np
 
 FINEST: Final = 2_500_000  #: finest bin [ns]: 400 Hz, above the cutoff of the friction filter
 MOST_SAMPLES: Final = 2**20  #: largest number of samples that are kept
+RUN: Final = 100  #: least mean number of samples of each of several runs in one recording
 _GATHERED: Final = 2**16  # smallest number of added samples that is sorted
 _LARGEST: Final = 1e100  # upper limit of a plausible measurement [SI]
 _MAX_NAMES: Final = 100  # largest number of joint names kept for error messages
 _GAP: Final = 10.0  # shortest gap between samples [sampling periods]
+_NEAR: Final = 0.1  # latest time at which a second run starts, as a part of all times
+_OVERLAP: Final = 10  # least number of samples of a second run at times of the one before
 _STRAY: Final = 0.1  # smaller fractions of messages with other joint names are reported as faults
 _LATENCIES: Final = (64, 2**16)  # largest number of latencies kept of a batch, and of a topic
 
@@ -313,6 +317,9 @@ class Gathering:
         self._by_header = by_header
         self._series = Series(source.width)
         self._latencies: list[IntArray] = []
+        #: Stamps in order of reception, of every message or fewer.
+        self._received: list[IntArray] = []
+        self._every, self._count = 1, 0
         self._unstamped = self._invalid = self._unusable = self._unwanted = self._messages = 0
         self._fault = ''
 
@@ -334,10 +341,18 @@ class Gathering:
         usable = (np.abs(values) < _LARGEST).all(axis=1)
         self._unusable += int(np.count_nonzero(~usable))
         self._series.add(stamps[usable], values[usable])
+        self._keep(stamps[usable])
         few, many = _LATENCIES
         self._latencies.append((received - stamps)[:: max(1, len(stamps) // few)])
         if len(self._latencies) * few > many:
             self._latencies = [np.concatenate(self._latencies)[::2]]
+
+    def _keep(self, stamps: IntArray) -> None:
+        self._received.append(stamps[:: self._every])
+        self._count += len(self._received[-1])
+        if self._count > MOST_SAMPLES:
+            self._received = [np.concatenate(self._received)[::2]]
+            self._every, self._count = 2 * self._every, len(self._received[0])
 
     @property
     def has_no_values(self) -> bool:
@@ -363,6 +378,10 @@ class Gathering:
         if len(series.stamps) < 2:
             fault = f'must have >= 2 samples at different times, has {len(series.stamps)}'
             self._reject(bag, fault)
+        if first := restart_of(np.concatenate(self._received)):
+            place = f'message {first * self._every + 1} of {self._messages}'
+            remedy = 'use --time receive, or split the bag' if self._by_header else 'split the bag'
+            self._reject(bag, f'time restarts at {place}: {remedy}')
         bag.losses += series.losses(name)
         bag.losses += [f'{name} {loss}' for loss in self._source.losses()]
         return Samples(name, series.stamps, series.values, np.concatenate(self._latencies))
@@ -375,6 +394,32 @@ class Gathering:
 def are_gaps(steps: IntArray | FloatArray) -> BoolArray:
     """Return which steps between samples, (n,), are gaps, without interpolation."""
     return np.asarray(steps > _GAP * np.median(steps))
+
+
+def are_covered(stamps: IntArray | FloatArray, others: IntArray | FloatArray) -> BoolArray:
+    """Return which stamps, (n,), lie between two others, in order, that are no gap."""
+    steps = np.diff(others)
+    after = np.clip(np.searchsorted(others, stamps), 1, len(steps))
+    inside = (others[0] <= stamps) & (stamps <= others[-1])
+    return np.asarray(inside & ~are_gaps(steps)[after - 1])
+
+
+def restart_of(time: IntArray | FloatArray, least: int = RUN) -> int:
+    """Return the first sample of a second run, whose time begins again, else 0."""
+    steps = np.diff(time)
+    back = np.flatnonzero(are_gaps(np.abs(steps)) & (steps < 0)) + 1
+    # Samples in any order are sorted.
+    if len(back) > len(time) // least:
+        return 0
+    latest = time.min() + _NEAR * np.ptp(time)
+    for begin, end in pairwise([*back, len(time)]):
+        run, before = time[begin:end], np.unique(time[:begin]).astype(np.float64)
+        # Neither a part that was stored in another place or came late, nor single wrong times.
+        if run[0] > latest or len(before) < _OVERLAP:
+            continue
+        if np.count_nonzero(are_covered(run, before)) >= _OVERLAP:
+            return int(begin)
+    return 0
 
 
 def position_and_velocity(samples: Samples, bag: SampleOrigin) -> Samples:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 import csv
 from datetime import datetime
-from itertools import islice, pairwise
+from itertools import islice
 import os
 from pathlib import Path
 import re
@@ -26,7 +26,7 @@ from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.bags.bag import MATLAB, TABLES
 from needle_identification.bags.compression import BLOCK, Budget, DAMAGED
 from needle_identification.errors import RecordingError
-from needle_identification.recordings.samples import are_gaps, Series
+from needle_identification.recordings.samples import restart_of, RUN, Series
 from needle_ros.column_units import (
     BRACKETS,
     foreign_unit,
@@ -58,9 +58,7 @@ _DAMAGED: Final = (*DAMAGED, zlib.error, EOFError, IndexError, AttributeError)
 _MATLAB_HEAD: Final = 128  # length of the header of a MATLAB file [bytes]
 _COMPRESSED: Final = 15  # type code of its compressed variables
 _HEAD: Final = 200  # number of lines searched for the first line of numbers
-_RUN: Final = 100  # least mean number of rows of each of several runs in one table
-_NEAR: Final = 0.1  # latest time at which a second run starts, as a part of all times
-_OVERLAP: Final = 10  # least number of rows of a second run at times of the one before
+_LATEST: Final = 9e9  # largest time whose nanoseconds are 64-bit integers [s]
 _LONGEST_LINE: Final = 2**16  # longest plausible line of a sample [characters]
 #: Probable unit, and the range, or for time the median step, above which it is rarely in SI units.
 _SUSPICIOUS: Final = {
@@ -120,7 +118,7 @@ def guessed(
     names: Iterable[str], usual_names: Mapping[str, Sequence[str]] = _USUAL
 ) -> dict[str, str]:
     """Find names by role from usual names, in order of preference, lower case without signs."""
-    # Roles of friction are also found by unit: the only column with a unit of force is the force.
+    # Time, and the roles of friction, are also found by unit: the only column with a unit of it.
     plain = {name: plain_name(name) for name in names}
     found: dict[str, str] = {}
     for role, usual in usual_names.items():
@@ -130,7 +128,7 @@ def guessed(
             if alike:
                 found[role] = alike[0]
                 break
-    for role in ROLES if usual_names is _USUAL else ():
+    for role in ROLES if usual_names is _USUAL else {'time'} & {*usual_names}:
         by_unit = [name for name in plain if unit_of(name, role)]
         if len(by_unit) == 1 and by_unit[0] not in found.values():
             found.setdefault(role, by_unit[0])
@@ -268,6 +266,10 @@ def sorted_rows(
     check_restart(path, time, usable)
     time, rows = time[usable], rows[usable]
     start = float(time.min())
+    if not abs(start) < _LATEST:
+        raise RecordingError(
+            f'{path}: time starts at {start:.3g} s: is its unit right? {"; ".join(losses)}'.strip()
+        )
     since = time - start
     if not since.max() < 1e9:
         raise RecordingError(f'{path}: time spans {since.max():.3g} s: is its unit right?')
@@ -280,30 +282,13 @@ def sorted_rows(
     return start, series.stamps, series.values
 
 
-def check_restart(path: Path, time: FloatArray, usable: BoolArray, least: int = _RUN) -> None:
+def check_restart(path: Path, time: FloatArray, usable: BoolArray, least: int = RUN) -> None:
     """Raise a RecordingError if the time begins again, in runs of at least some mean rows."""
-    if row := _restart(time[usable], least):
+    if row := restart_of(time[usable], least):
         row = int(np.flatnonzero(usable)[row]) + 1
         raise RecordingError(
             f'{path}: time restarts at row {row} of {len(usable)}: split the file'
         )
-
-
-def _restart(time: FloatArray, least: int) -> int:
-    """Return the first row of a second run in a table, whose time begins again; else 0."""
-    steps = np.diff(time)
-    back = np.flatnonzero(are_gaps(np.abs(steps)) & (steps < 0.0)) + 1
-    # Rows in any order are sorted.
-    if len(back) > len(time) // least:
-        return 0
-    latest = time.min() + _NEAR * np.ptp(time)
-    for begin, end in pairwise([*back, len(time)]):
-        before, run = time[:begin], time[begin:end]
-        # Neither a part that was stored in another place, nor single wrong times.
-        overlap = np.count_nonzero((before.min() <= run) & (run <= before.max()))
-        if run[0] <= latest and overlap >= _OVERLAP:
-            return int(begin)
-    return 0
 
 
 # Text.
@@ -311,7 +296,7 @@ def _restart(time: FloatArray, least: int) -> int:
 
 def _text(path: Path) -> Table:
     head = [line.rstrip('\r\n') for line in islice(_lines(path), _HEAD)]
-    first = next((k for k, line in enumerate(head) if _numbers(line)), None)
+    first = _first_row(head)
     if not head:
         raise RecordingError(f'{path} is empty; valid: a table with named columns')
     if first is None:
@@ -342,6 +327,24 @@ def _text(path: Path) -> Table:
     known = np.atleast_1d(np.isfinite(table).any(axis=0))
     columns = {name: table[:, k] for k, name in enumerate(names) if known[k]}
     return Table(path, columns, {}, losses)
+
+
+def _first_row(head: Sequence[str]) -> int | None:
+    """Return the first row of numbers in the form of most below it, not a line of metadata."""
+    lines = [k for k, line in enumerate(head) if _numbers(line)]
+    for at, first in enumerate(lines):
+        separator = _separator(head[first])
+        rows = [_split(head[k], separator) for k in lines[at:]]
+        count = len(rows[0])
+        known = np.isfinite([[_number(word) for word in row] for row in rows if len(row) == count])
+        # Text above numbers is no value, but values of the rows directly above may be missing.
+        text_above = ~known[0] & (2 * known.sum(axis=0) > len(known))
+        if 2 * len(known) > len(rows) and not text_above.any():
+            begin = first
+            while begin - 1 in lines and len(_split(head[begin - 1], separator)) == count:
+                begin -= 1
+            return begin
+    return lines[0] if lines else None
 
 
 def _rows(path: Path, first: int, separator: str | None, count: int) -> tuple[FloatArray, int]:

@@ -112,6 +112,19 @@ def test_the_needle_axis_is_chosen_among_components(tmp_path: Path) -> None:
     assert 'which depth is' in inspect_recording(path).lacking
 
 
+@pytest.mark.parametrize('axis', ['x', 'y', 'z'])
+def test_the_only_component_that_varies_is_read(tmp_path: Path, axis: str) -> None:
+    """The others are constant, at zero or at another place."""
+    made = strokes(seed=1, push=0.0)
+    still = np.zeros_like(made.time)
+    depth = [1e3 * made.depth if one == axis else still + 412.3 for one in 'xyz']
+    force = [made.force if one == axis else still for one in 'xyz']
+    names = 'time,x_mm,y_mm,z_mm,Fx_N,Fy_N,Fz_N'
+    path = written(tmp_path / 'run.csv', names, made.time, *depth, *force)
+    assert_true(identify_friction(read_friction_recording(path)))
+    assert f'depth={axis}_mm,force=F{axis}_N' in inspect_recording(path).command
+
+
 @pytest.mark.parametrize('angle', [0.05, 0.6])
 def test_an_oblique_motion_is_named(tmp_path: Path, angle: float) -> None:
     """Above 0.1 rad, where its speed along the axis is 0.5 % too small."""

@@ -13,13 +13,14 @@ from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from needle_identification import (
     BagWriter,
+    inspect_recording,
     read_friction_recording,
     read_indentation_recording,
     RecordingError,
 )
 from needle_identification.bags.messages import message_type
 from needle_identification.recordings.merging import clock_offset
-from needle_identification.recordings.samples import Samples
+from needle_identification.recordings.samples import restart_of, Samples
 from needle_ros.errors import ParameterError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -523,6 +524,69 @@ def test_dense_samples_are_averaged_without_delay(tmp_path: Path) -> None:
     # The mean over a bin of width h has an error of (2 pi f h)^2 / 24 = 3e-4.
     wave = np.sin(2.0 * np.pi * frequency * (read.time + begin))
     assert_allclose(read.force, wave, rtol=0.0, atol=4e-4)
+
+
+def two_runs(path: Path, second: int) -> Path:
+    """Write two runs of 400 messages each, stamped from 0 and from a time [ms]."""
+    stamps = [*range(0, 4000, 10), *range(second, second + 4000, 10)]
+    messages = [
+        (i * 10, wrench(at(stamp), float(i)), joint_states(at(stamp), 1e-3 * i, 0.1))
+        for i, stamp in enumerate(stamps)
+    ]
+    return write(
+        path,
+        {
+            '/ft': (WRENCH, [(t, data) for t, data, _ in messages]),
+            '/joints': (MOTION, [(t, data) for t, _, data in messages]),
+        },
+    )
+
+
+@pytest.mark.parametrize('second', [0, 3, 300])
+def test_stamps_that_restart_are_named(tmp_path: Path, second: int) -> None:
+    """The runs are not mixed, nor is one left out; the receive times have both in order."""
+    path = two_runs(tmp_path / 'bag', second)
+    with pytest.raises(
+        RecordingError, match='/ft time restarts at message 401 of 800: use --time'
+    ):
+        read_friction_recording(path)
+    assert any('time restarts' in loss for loss in inspect_recording(path).losses)
+    assert_array_equal(read_friction_recording(path, time='receive').force, np.arange(800.0))
+
+
+@given(
+    begin=strategies.integers(0, 300),
+    late=strategies.integers(11, 100),
+    after=strategies.integers(1, 100),
+)
+def test_messages_that_come_late_are_no_restart(begin: int, late: int, after: int) -> None:
+    """Also near the start: no other messages have their times."""
+    order = np.arange(1000)
+    parts = np.split(order, np.cumsum([begin, late, after]))
+    assert restart_of(np.concatenate([parts[0], parts[2], parts[1], parts[3]])) == 0
+    assert restart_of(np.concatenate([order, order + begin * 0.1])) == len(order)
+
+
+@pytest.mark.parametrize('factor', [1.0, 1e3])
+def test_presses_in_mm_are_suspected(tmp_path: Path, factor: float) -> None:
+    """Also of stiff tissue, by the positions under force and not on the way there."""
+    way = [(i, (-0.5 + 0.05 * i, 0.0, 0.0), 0.0) for i in range(10)]
+    presses = [
+        (10 + 10 * i + k, (2e-4 * size * (k > 4), 0.0, 1e-4 * size * (k > 4)), size * (k > 4))
+        for i, size in enumerate([1.0, -1.0, 1.5])
+        for k in range(10)
+    ]
+    vector = message_type('geometry_msgs/msg/Vector3')
+    forces, poses = [], []
+    for i, place, size in (*way, *presses):
+        stamp = at(10 * i)
+        one = message_type('geometry_msgs/msg/Wrench')(vector(size, 0.0, size), vector(0, 0, 0))
+        forces.append((10 * i, serialized(WRENCH, stamp, one)))
+        scaled = tuple(factor * x for x in place)
+        poses.append((10 * i, serialized(POSE, stamp, pose(scaled))))
+    path = write(tmp_path / 'bag', {'/ft': (WRENCH, forces), '/ee': (POSE, poses)})
+    losses = ' '.join(read_indentation_recording(path).losses)
+    assert ('perhaps --axes x[mm]' in losses) == (factor > 1.0)
 
 
 # Indentation.

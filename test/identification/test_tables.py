@@ -19,8 +19,9 @@ from needle_identification import (
 )
 from needle_identification.recordings import samples, tables
 from needle_identification.recordings.tables import column_roles, guessed, read_table
+from needle_identification.sensor.reading import read_sensor_recording
 import numpy as np
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 import pytest
 from scipy.io import savemat
 from support.strokes import COULOMB, strokes, VISCOUS
@@ -279,6 +280,55 @@ def test_other_orders_of_rows_are_no_restart(tmp_path: Path, run: Any) -> None:
     assert len(read.time) == len(rows) - 1
 
 
+@pytest.mark.parametrize('separator', [',', ';', '\t'])
+@pytest.mark.parametrize(
+    'above',
+    [
+        'Channels,3',
+        'Operator,Meier\nDate,2026-01-02\nSample,12',
+        'Port,1\nFrames,3000\n',
+        'Sample,1,2',
+        '"Test","1"\n',
+        'X-Steps 1',
+    ],
+)
+@pytest.mark.parametrize('missing', [False, True])
+def test_metadata_above_the_header_do_not_change_a_table(
+    tmp_path: Path, run: Any, above: str, separator: str, missing: bool
+) -> None:
+    """Also if values of the first rows are missing."""
+    text = lines('time,depth,force', *run)
+    if missing:
+        first, second, *rest = text.splitlines()[1:]
+        first, second = (
+            word.join(row.split(',')[::2]) for word, row in [(',n/a,', first), (',,', second)]
+        )
+        text = '\n'.join(['time,depth,force', first, second, *rest, ''])
+    plain = read_table(written(tmp_path, text.replace(',', separator)))
+    table = read_table(written(tmp_path, f'{above}\n{text}'.replace(',', separator)))
+    assert [*table.columns] == ['time', 'depth', 'force']
+    assert table.losses == plain.losses == []
+    for name, column in plain.columns.items():
+        assert len(column) == len(run[0])
+        assert_array_equal(table.columns[name], column)
+
+
+@pytest.mark.parametrize(('factor', 'unit'), [(1e3, 'ms'), (1e6, 'us'), (1e9, 'ns')])
+def test_dates_without_their_unit_are_rejected(
+    tmp_path: Path, run: Any, factor: float, unit: str
+) -> None:
+    """Times since 1970 in s are read, and with a unit in other units."""
+    time, depth, force = run
+    path = written(
+        tmp_path, lines('time,q,F', factor * (1.76e9 + time), depth, force, form='.17g')
+    )
+    with pytest.raises(RecordingError, match=rf'time starts at 1.76e.*: is its.*time\[{unit}\]'):
+        read_friction_recording(path)
+    read = read_friction_recording(path, columns={'time': f'time[{unit}]'})
+    # Of a double at 1.76e9 s.
+    assert_allclose(read.time, time - time[0], atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ('text', 'columns', 'said'),
     [
@@ -366,6 +416,16 @@ def test_columns_of_any_language_are_found_by_their_units(tmp_path: Path, sign: 
     words = f"'time=Zeit [ms],depth={'-' if sign < 0.0 else ''}Achse_mm,force=Kraft [N]'"
     assert found.command == f'needle identify friction {path} --columns {words}'
     assert any('motion reversed' in one for one in found.words) == (sign < 0.0)
+
+
+@pytest.mark.parametrize('heading', ['Zeit [s]', 'temps (s)', 'uhr_s'])
+def test_the_only_column_with_a_unit_of_time_is_the_time(tmp_path: Path, heading: str) -> None:
+    """Of friction, and of a tip sensor."""
+    values = np.linspace(0.0, 1.0, 60), *np.random.default_rng(1).normal(size=(3, 60))
+    path = written(tmp_path, lines(f'{heading},x [mm],y [mm],z [mm]', *values))
+    read = read_sensor_recording(path, (0.0, 0.0, 0.0))
+    assert_allclose(read.time, values[0], atol=1e-9)
+    assert guessed([heading, 'q [mm]'])['time'] == heading
 
 
 def test_averaged_rows_of_a_long_table_are_reported(
