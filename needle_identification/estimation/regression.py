@@ -118,6 +118,7 @@ def regress(
     correlation: int = 1,
     groups: IntArray | None = None,
     regressor_noise: FloatArray | None = None,
+    noise_moments: FloatArray | None = None,
     used: BoolArray | None = None,
     colored: bool = False,
 ) -> Regression:
@@ -138,6 +139,8 @@ def regress(
         Group of each sample, in which ``weighted`` measures the noise.
     regressor_noise : ndarray, shape (k,), optional
         Standard deviation of the noise of each column, for ``total``.
+    noise_moments : ndarray, shape (k, k), optional
+        Sums of squares and products of the noise in the used columns, which determines nothing.
     used : ndarray of bool, shape (n,), optional
         Samples to use; default all. Unused samples preserve the time between the others.
     colored : bool
@@ -178,7 +181,8 @@ def regress(
     x = x / norms
     singular, directions = np.linalg.svd(np.linalg.qr(x, mode='r'))[1:]
     # Null directions are omitted; parameters without a component in them are still solved.
-    basis, unknown = determinable(singular, directions)
+    moments = None if noise_moments is None else noise_moments / np.outer(norms, norms)
+    basis, unknown = determinable(singular, directions, moments)
     x = x @ basis
     if estimator == 'ordinary':
         solution = _weighted(x, y, used.astype(np.float64))
@@ -309,12 +313,22 @@ def _total(x: FloatArray, y: FloatArray, used: BoolArray, noise: FloatArray) -> 
     return _Solution(values, np.asarray(np.linalg.inv(normal)), x, np.asarray(scores))
 
 
-def determinable(singular: FloatArray, directions: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return a basis (k, r) of the determined directions, and unknown parameters, of an SVD."""
+def determinable(
+    singular: FloatArray, directions: FloatArray, noise: FloatArray | None = None
+) -> tuple[FloatArray, BoolArray]:
+    """
+    Return a basis (k, r) of the determined directions, and unknown parameters, of an SVD.
+
+    ``noise`` is the part of the squares and products of the columns, (k, k), that is noise.
+    """
     null = singular <= _ROUNDING * singular[0]
-    weak = singular * LARGEST_CONDITION < singular[0]
     unknown = (np.abs(directions[null]) > np.sqrt(_ROUNDING)).any(axis=0)
-    unknown |= (np.abs(directions[weak]) > _LARGEST_SHARE).any(axis=0)
+    strengths, excited = singular**2, directions
+    if noise is not None:
+        strengths, turn = np.linalg.eigh(np.diag(strengths) - directions @ noise @ directions.T)
+        excited = turn.T @ directions
+    weak = strengths * LARGEST_CONDITION**2 < strengths.max()
+    unknown |= (np.abs(excited[weak]) > _LARGEST_SHARE).any(axis=0)
     return directions[~null].T, np.asarray(unknown)
 
 

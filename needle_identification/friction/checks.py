@@ -50,9 +50,12 @@ def fit_warnings(
     terms describe the friction, otherwise the residual is no noise.
     """
     unknown = [parameter.name for parameter in parameters if not parameter.determined]
+    hidden = design.hidden_words()
     if unknown:
-        cure = f'use more speeds, or fewer terms{design.signals.noise_remedy}'
+        cure = f'use more speeds, or fewer terms{"; " if hidden else ""}{hidden}'
         yield f'the data do not determine {", ".join(unknown)}: {cure}'
+    elif hidden:
+        yield hidden
     settings = design.signals.settings
     if 'coulomb_friction' not in unknown:
         yield from _of_zero(design)
@@ -138,7 +141,7 @@ def noise_bias(design: Design, fit: Regression) -> float:
         return 0.0
     x = design.regressors(settings.terms).take(design.rows, axis=0)[:, : len(columns)]
     bias = float(fit.values[k] * fit.samples * noise**2 * np.linalg.pinv(x.T @ x)[k, k])
-    return bias if abs(bias) > 0.5 * fit.errors[k] else 0.0
+    return bias if bias > 0.5 * fit.errors[k] else 0.0
 
 
 def noise_words(design: Design, bias: float) -> str:

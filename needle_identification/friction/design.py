@@ -25,13 +25,16 @@ from needle_identification.friction.settings import OF_VELOCITY
 from needle_identification.friction.terms import columns_of, NeedleMotion, regressors
 import numpy as np
 from scipy.fft import next_fast_len
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 FEWEST_SAMPLES: Final = 10.0  #: smallest number of independent samples in motion
 _SETTLING: Final = 3.0  # settling time of the sensor filters after a change [lags of the force]
 _SAME_DEPTH: Final = 5e-5  # tolerance of the largest depth [m]: counts, noise, backlash
 _EFFECT: Final = 0.05  # smallest fraction of the full size of a term that counts as an effect
 _DECAY: Final = 5.0  # settling time of a low-pass filter of the force [time constants]
+_STEADY: Final = 10  # correlation lengths of the noise, over which slow motion is averaged
+_SURE: Final = 5.0  # smallest mean speed of slow motion [standard errors]
+_MUCH: Final = 0.1  # smallest time of hidden motion that is reported [times of used samples]
 _LONGEST_SETTLING: Final = 0.1  # largest settling time [s]; a longer lag is a clock offset
 
 
@@ -190,8 +193,36 @@ class Design:
             correlation=signals.correlation,
             groups=self.stroke,
             regressor_noise=np.array(noise),
+            noise_moments=self._noise_moments(terms),
             used=self.used,
             colored=True,
+        )
+
+    def _noise_moments(self, terms: Sequence[str]) -> FloatArray | None:
+        """Return the squares and products (k, k) of the noise of the velocity, if any."""
+        noise = self.column_noise(terms)
+        if noise is None:
+            return None
+        return np.pad(noise.T @ noise, (0, self.lag_column.shape[1]))
+
+    def hidden_words(self) -> str:
+        """Return words about slow motion that the noise of the velocity hides, or ''."""
+        signals, size = self.signals, self.signals.correlation
+        count = len(self.velocity) // size
+        if signals.moving_speed <= signals.settings.moving_speed or count <= _STEADY:
+            return ''
+        parts = self.velocity[: count * size].reshape(count, size).mean(axis=1)
+        mean, square = uniform_filter1d(parts, _STEADY), uniform_filter1d(parts**2, _STEADY)
+        error = np.sqrt(np.maximum(square - mean**2, 0.0) / (_STEADY - 1))
+        # The mean of noise is below a standard deviation of the noise.
+        least = max(signals.settings.moving_speed, signals.velocity_noise)
+        speed = np.abs(mean)
+        hidden = (speed > least) & (speed < signals.moving_speed) & (speed > _SURE * error)
+        lasts = np.count_nonzero(hidden) * size * signals.period
+        if lasts < _MUCH * len(self.rows) * signals.period:
+            return ''
+        return (
+            f'{lasts:.2g} s of motion are left out: {signals.noise_words}: choose a lower cutoff'
         )
 
     def _fast_words(self) -> str:

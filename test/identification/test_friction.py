@@ -4,6 +4,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+import re
 from typing import Any
 
 from needle_dynamics import FloatArray, NeedleError, ParameterError
@@ -402,6 +403,58 @@ def test_one_speed_does_not_determine_two_coefficients(both_ways: bool, seed: in
         assert not found[name].determined
         assert found[name].interval == (-np.inf, np.inf)
     assert any('do not determine coulomb_friction' in words for words in found.warnings)
+
+
+def measured(*speeds: float, noise: float, seed: int) -> Recording:
+    """Record positions with noise [m], of strokes of 3 s in and out at each speed [m/s]."""
+    rng = np.random.default_rng(seed)
+    rest = np.zeros(100)
+    legs = [np.full(600, way * speed) for speed in speeds for way in (1.0, -1.0)]
+    velocity = np.concatenate([part for leg in legs for part in (rest, leg)])
+    time = np.asarray(0.005 * np.arange(len(velocity)))
+    depth = 0.005 * np.cumsum(velocity) + rng.normal(scale=noise, size=len(time))
+    force = COULOMB * np.sign(velocity) + VISCOUS * velocity
+    force += rng.normal(scale=0.01, size=len(time))
+    return Recording(name='measured', time=time, depth=depth, force=force)
+
+
+@pytest.mark.parametrize(('speed', 'noise'), [(5e-4, 3e-7), (5e-4, 1e-6), (1e-3, 2e-6)])
+def test_noise_of_the_speed_is_no_second_speed(speed: float, noise: float) -> None:
+    """Position noise up to that which hides the speed; another speed determines mu_v."""
+    for seed in range(10):
+        found = identify_friction(measured(speed, speed, noise=noise, seed=seed))
+        assert not any(found[name].determined for name in TRUTH)
+        assert found.warnings[-1].endswith('use more speeds, or fewer terms')
+        found = identify_friction(measured(speed, 4.0 * speed, noise=noise, seed=seed))
+        # 60 intervals of 95 %.
+        assert all(within(found[name], truth, 4.5) for name, truth in TRUTH.items())
+
+
+@pytest.mark.parametrize('others', [(), (2e-3,)])
+def test_slow_strokes_that_noise_hides_are_named_with_a_remedy(others: tuple[float]) -> None:
+    """Whether the other strokes determine the friction or not."""
+    recording = measured(1.5e-4, 2e-4, 8e-4, *others, noise=1e-6, seed=1)
+    found = identify_friction(recording)
+    assert found['viscous_friction'].determined == bool(others)
+    said = r's of motion are left out: noise .* hides motion below .*: choose a lower cutoff'
+    assert re.search(said, '; '.join(found.warnings))
+    found = identify_friction(recording, FrictionSettings(cutoff=5.0))
+    assert 'left out' not in '; '.join(found.warnings)
+    assert all(within(found[name], truth) for name, truth in TRUTH.items())
+
+
+@pytest.mark.parametrize('noise', [1e-6, 5e-6])
+def test_rests_are_no_hidden_motion(noise: float) -> None:
+    for seed in range(5):
+        recording = measured(2e-3, 5e-3, 1e-2, noise=noise, seed=seed)
+        before = np.random.default_rng(seed).normal(scale=noise, size=4000) + recording.depth[0]
+        resting = Recording(
+            time=np.asarray(0.005 * np.arange(4000 + len(recording.time))),
+            depth=np.concatenate([before, recording.depth]),
+            force=np.concatenate([np.zeros(4000), recording.force]),
+        )
+        for one in (recording, resting):
+            assert 'hides' not in '; '.join(identify_friction(one).warnings)
 
 
 def test_offset_and_direction_together_are_not_determined() -> None:

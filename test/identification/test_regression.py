@@ -175,6 +175,22 @@ def test_nearly_collinear_parameters_are_not_determined(spread: float, determine
     assert (found.determined == determined).all()
 
 
+@pytest.mark.parametrize('noise', [0.1, 0.2])
+@pytest.mark.parametrize(('spread', 'determined'), [(0.0, False), (0.05, False), (0.3, True)])
+def test_noise_of_the_regressors_determines_nothing(
+    spread: float, determined: bool, noise: float
+) -> None:
+    """The same parameters are determined with and without noise that is known."""
+    rng = np.random.default_rng(0)
+    velocity = 5e-3 * (1.0 + spread * rng.normal(size=(5000, 1)))
+    velocity = np.hstack([velocity, velocity + 5e-3 * noise * rng.normal(size=(5000, 1))])
+    moments = np.diag([0.0, 5000 * (5e-3 * noise) ** 2])
+    for column, known in zip(velocity.T, (None, moments), strict=True):
+        x = np.column_stack([np.ones(5000), column])
+        found = regress(x, 0.56 + 300.0 * velocity[:, 0], noise_moments=known)
+        assert (found.determined == determined).all()
+
+
 def test_a_column_of_zeros_is_not_determined() -> None:
     x, y, _ = problem(noise=0.1)
     found = regress(np.column_stack([x, np.zeros(len(y))]), y)
