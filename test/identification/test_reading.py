@@ -19,6 +19,7 @@ from needle_identification import (
     RecordingError,
 )
 from needle_identification.bags.messages import message_type
+from needle_identification.recordings import samples
 from needle_identification.recordings.merging import clock_offset
 from needle_identification.recordings.samples import restart_of, Samples
 from needle_ros.errors import ParameterError
@@ -543,13 +544,19 @@ def two_runs(path: Path, second: int) -> Path:
 
 
 @pytest.mark.parametrize('second', [0, 3, 300])
-def test_stamps_that_restart_are_named(tmp_path: Path, second: int) -> None:
+def test_stamps_that_restart_are_named(
+    tmp_path: Path, second: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The runs are not mixed, nor is one left out; the receive times have both in order."""
     path = two_runs(tmp_path / 'bag', second)
-    with pytest.raises(
-        RecordingError, match='/ft time restarts at message 401 of 800: use --time'
-    ):
+    said = '/ft time restarts at message 401 of 800: use --time receive, or split'
+    with pytest.raises(RecordingError, match=said):
         read_friction_recording(path)
+    with monkeypatch.context() as patch:
+        # Of a long recording fewer stamps are kept.
+        patch.setattr(samples, 'MOST_SAMPLES', 500)
+        with pytest.raises(RecordingError, match=said):
+            read_friction_recording(path)
     assert any('time restarts' in loss for loss in inspect_recording(path).losses)
     assert_array_equal(read_friction_recording(path, time='receive').force, np.arange(800.0))
 
