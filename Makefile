@@ -94,9 +94,7 @@ results: setup
 
 # Numbers of docs/benchmarks.md, on an otherwise idle machine. A missed bar does not stop the run.
 bench: $(VENV)/.bench
-	status=0; for name in control laws dynamics honesty steering-model steering-fit steering safety commissioning identification 'graph --full' slicer study environments pool plan calibration; do \
-	$(BIN)/needle bench $$name -o docs/results/$${name%% *}.md || status=1; \
-	done; exit $$status
+	$(BIN)/python -m benchmarks.run docs/results
 
 $(VENV)/.bench: setup.py $(VENV)/.complete
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-build-isolation -e '.[bench]'

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+import subprocess
 import sys
 import time
 from typing import Final, TypeAlias
@@ -41,6 +42,11 @@ MODULES = {
     'pool': ('pool',),
     'learning': ('learning',),
     'plan': ('plans',),
+}
+
+#: Arguments of each benchmark with a page, which ``python -m benchmarks.run FOLDER`` makes.
+PAGES: Final = {name: '' for name in MODULES if name not in ('damage', 'pool')} | {
+    'calibration': '--recordings 300'
 }
 
 #: Extras of a benchmark that needs more than ``bench`` and ``ros``.
@@ -150,3 +156,18 @@ def ask(name: str, command: str, questions: Sequence[Question]) -> tuple[str, bo
             tell(f'\n{section}')
     tell(f'\n{conclusion(bars, time.perf_counter() - begin)}')
     return page, any(bar.missed for bar in bars)
+
+
+def make_pages(folder: Path) -> int:
+    """Make all pages; return 1 if a benchmark fails or misses a bar, which stops no other one."""
+    failed = 0
+    for name, words in PAGES.items():
+        command = ['needle_insertion.cli', 'bench', name, *words.split()]
+        page = str(folder / f'{name}.md')
+        done = subprocess.run([sys.executable, '-m', *command, '-o', page], check=False)
+        failed |= done.returncode
+    return int(bool(failed))
+
+
+if __name__ == '__main__':
+    sys.exit(make_pages(Path(sys.argv[1])))

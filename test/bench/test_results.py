@@ -8,12 +8,14 @@ from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 import re
+import subprocess
+from subprocess import CompletedProcess
 
-from benchmarks.run import MODULES
+from benchmarks.run import make_pages, MODULES, PAGES
 import pytest
 from support.installed import ROOT
 
-PAGES = ROOT / 'docs/results'
+FOLDER = ROOT / 'docs/results'
 #: Bar without a known limit.
 ANY = '.+'
 
@@ -61,12 +63,38 @@ def bars(modules: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 def rows(name: str) -> list[tuple[str, str]]:
     """Return names and limits in the table of bars of a page."""
-    _, _, table = (PAGES / f'{name}.md').read_text(encoding='utf-8').partition('## Bars\n')
+    _, _, table = (FOLDER / f'{name}.md').read_text(encoding='utf-8').partition('## Bars\n')
     cells = [line.strip('|').split('|') for line in table.splitlines() if line.startswith('|')]
     return [(one[0].strip(), one[1].strip()) for one in cells[2:]]
 
 
-@pytest.mark.parametrize('name', [name for name in MODULES if (PAGES / f'{name}.md').exists()])
+def test_docs_list_every_benchmark_and_its_page() -> None:
+    """No other page of a benchmark exists."""
+    text = (ROOT / 'docs/benchmarks.md').read_text(encoding='utf-8')
+    found = dict(
+        re.findall(r'^\| ([\w-]+) \|.*\| (?:\[[\w-]+\]\(results/)?([^|)]+).*\|$', text, re.M)
+    )
+    shown = {name: f'{name}.md' if name in PAGES else 'no page ' for name in MODULES}
+    assert {name: found.get(name) for name in MODULES} == shown
+    assert {name for name in MODULES if (FOLDER / f'{name}.md').exists()} == {*PAGES}
+
+
+def test_all_pages_are_made_after_a_missed_bar(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[list[str]]()
+
+    def run(command: list[str], **_options: object) -> CompletedProcess[str]:
+        asked.append(command[command.index('bench') + 1 :])
+        return CompletedProcess(command, int(len(asked) == 1))
+
+    monkeypatch.setattr(subprocess, 'run', run)
+    assert make_pages(tmp_path) == 1
+    expected = [[name, *PAGES[name].split(), '-o', str(tmp_path / f'{name}.md')] for name in PAGES]
+    assert asked == expected
+
+
+@pytest.mark.parametrize('name', PAGES)
 def test_result_page_has_the_bars_of_the_benchmark(name: str) -> None:
     """Otherwise the page is older than the benchmark: run it again with ``-o``."""
     shown, own = rows(name), list(bars(MODULES[name]))
