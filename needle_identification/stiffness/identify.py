@@ -10,14 +10,13 @@ places is as in Table 2.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, pairwise, product
-from math import hypot, nan, sqrt
+from itertools import chain, pairwise
+from math import degrees, hypot, nan, sqrt
 from typing import Final
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import (
-    check_sign,
     DisplayedEstimate,
     EstimateRows,
     measured,
@@ -33,7 +32,7 @@ from needle_identification.estimation.prediction import (
     RecordingPrediction,
 )
 from needle_identification.recordings.recording import IndentationRecording
-from needle_identification.stiffness import matrix
+from needle_identification.stiffness import checks, matrix
 from needle_identification.stiffness.plateaus import find_plateaus, StiffnessSettings
 from needle_identification.stiffness.presses import find_presses, grouped, Presses
 import numpy as np
@@ -229,7 +228,8 @@ def identify_stiffness(
     Raises
     ------
     IdentificationError
-        If there is no press, or if the stiffness is negative.
+        If there is no press, if the stiffness is negative, or if nearly each press has
+        its own level of force.
 
     Examples
     --------
@@ -254,15 +254,19 @@ def identify_stiffness(
         fit = partial(matrix.fit_matrix, presses, noise, estimator=settings.estimator)
         fits = [fit(np.flatnonzero(chosen)) for chosen in members]
         levels = [_level(presses, *pair, settings) for pair in zip(members, fits, strict=True)]
-        for level, name in product(levels, ('k_xx', 'k_zz')):
-            check_sign('stiffness', level[name])
+        for level, one in zip(levels, fits, strict=True):
+            checks.check_axes(one, (level['k_xx'], level['k_zz']), level.principal[1])
+        checks.check_levels(presses, fits, settings)
     except IdentificationError as error:
         raise type(error)(f'{recording.name}: {error}') from None
     by_doubt: dict[str, list[str]] = {}
-    for level, one in zip(levels, fits, strict=True):
-        for doubt, detail in _doubts(level, one):
+    for index, (level, one) in enumerate(zip(levels, fits, strict=True)):
+        for doubt, detail in _doubts(level, one, presses.displacement[members[index]]):
             by_doubt.setdefault(doubt, []).append(f'{detail} at {level.force:.3g} N')
     warnings += [f'{doubt} ({"; ".join(details)})' for doubt, details in by_doubt.items()]
+    warnings += checks.unit_warnings(presses.force)
+    if not all(one.known.all() for one in fits):
+        warnings += checks.lag_warnings(recording)
     size = np.maximum(np.hypot(*presses.displacement.T), 1e-15)
     off_plane = float((np.abs(presses.off_plane) / size).max())
     if off_plane > _WORTH_WARNING:
@@ -320,15 +324,19 @@ def _level(
     )
 
 
-def _doubts(level: LevelEstimate, fit: matrix.MatrixFit) -> Iterator[tuple[str, str]]:
+def _doubts(
+    level: LevelEstimate, fit: matrix.MatrixFit, displacement: FloatArray
+) -> Iterator[tuple[str, str]]:
     """Yield warnings about the matrix of a level, each with a detail of this level."""
     if not fit.known.all():
         lacking = ', '.join(p.symbol for p in level.parameters if not p.determined)
         yield (
-            f'{lacking} not determined: at least three presses in two directions are needed',
+            f'{lacking} not determined: {checks.unknown_because(displacement, fit)}',
             f'{level.presses} in {level.directions}',
         )
         return
+    if words := checks.axes_doubt(fit, level.rotation):
+        yield words, f'{degrees(level.rotation.value):.3g} deg'
     if level.directions < _FEWEST_DIRECTIONS:
         yield 'few directions; the paper has 8', f'{level.directions}'
     if fit.scatter > _LARGEST_SCATTER:

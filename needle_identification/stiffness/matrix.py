@@ -15,7 +15,7 @@ antisymmetric part of K over the norm of its symmetric part. Its largest value f
 """
 
 from dataclasses import replace
-from math import atan2, degrees, hypot, inf, isfinite, nan, sqrt
+from math import atan, atan2, degrees, hypot, inf, isfinite, nan, pi, sqrt, tan
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
@@ -32,13 +32,14 @@ from scipy.optimize import brentq
 from scipy.special import fdtri, stdtr, stdtrit
 
 ENTRIES: Final = ('k_xx', 'k_xz', 'k_zx', 'k_zz')  #: entries of the matrix, by row
-_FEWEST_PRESSES: Final = 3  # smallest number of presses of a level
+FEWEST_PRESSES: Final = 3  #: Smallest number of presses of a level.
 
 #: Smallest ratio of scatter and error of the displacements that determines the matrix:
 #: attenuation by the noise of the displacements is then below 1 %.
 _SMALLEST_SPREAD: Final = 10.0
 
 _LARGEST_NOISE: Final = 3.0  # column norm over error of a column with only noise
+_LARGE: Final = 1e3  # ratio whose interval is shown as one limit
 _CURL: Final = np.array([[0.0, -1.0], [1.0, 0.0]])  # gradient of k_zx - k_xz by K
 
 
@@ -87,7 +88,7 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
     """Solve F = K d over the presses ``chosen`` (m,), with errors from their scatter."""
     displacement, force = presses.displacement[chosen], presses.force[chosen]
     error = sqrt(float(np.mean(presses.displacement_error[chosen] ** 2)) * len(chosen))
-    if len(chosen) < _FEWEST_PRESSES:
+    if len(chosen) < FEWEST_PRESSES:
         return MatrixFit()
     columns = np.flatnonzero(norm(displacement, axis=0) > _LARGEST_NOISE * error)
     singular = np.linalg.svd(displacement[:, columns], compute_uv=False)
@@ -232,20 +233,30 @@ def spring_estimates(
     if not spring.determined:
         return curl, spring, False, 'undetermined: the presses do not determine the whole matrix'
     _, freedom = fit.variance_of(gradient)
-    low, high = _unsigned_interval(abs(value), spring.error, freedom)
+    low, high = _ratio_interval(abs(value), spring.error, freedom)
     spring = replace(spring, value=abs(value), interval=(low, high))
-    is_spring = high <= limit
+    is_spring, is_zero = high <= limit, curl.interval[0] <= 0.0 <= curl.interval[1]
     verdict = 'a spring' if is_spring else 'not a spring' if low > limit else 'undecided'
     if low > limit:
         angle = rotation_estimate(fit)
         turned = measured(degrees(angle.value), degrees(angle.error))
         verdict += f' unless the axes of force and motion differ by a rotation of {turned} deg'
+    between = f'{low:.2%} to {high:.2%}' if high < _LARGE else f'above {low:.2%}'
     words = (
         f'{verdict}: antisymmetric part {spring.value:.2%} of the symmetric, 95 % interval '
-        f'{low:.2%} to {high:.2%}, limit {limit:.0%}; curl '
-        + ('zero within its error' if low == 0.0 else f'{curl.value:.3g} N/m')
+        f'{between}, limit {limit:.0%}; curl '
+        + ('zero within its error' if is_zero else f'{curl.value:.3g} N/m')
     )
     return curl, spring, is_spring, words
+
+
+def _ratio_interval(value: float, error: float, freedom: float) -> tuple[float, float]:
+    """Return the 95 % interval of a ratio of norms; above 1 from its angle."""
+    # The ratio has no finite error where the symmetric part is near zero, and its angle has.
+    if value <= 1.0:
+        return _unsigned_interval(value, error, freedom)
+    low, high = _unsigned_interval(atan(value), error / (1.0 + value**2), freedom)
+    return tan(low), tan(min(high, pi / 2.0 - ROUNDING))
 
 
 def _unsigned_interval(value: float, error: float, freedom: float) -> tuple[float, float]:

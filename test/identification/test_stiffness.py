@@ -17,6 +17,7 @@ from needle_identification import (
     StiffnessSettings,
     summarize_stiffness,
 )
+from needle_identification.errors import WrongSignError
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import ArrayLike
@@ -636,3 +637,64 @@ def test_parameters_are_read_by_name() -> None:
     assert level['curl'] is level.curl
     with pytest.raises(KeyError, match='valid: k_xx'):
         level['k_yy']
+
+
+def rotation(degrees: float) -> FloatArray:
+    angle = np.deg2rad(degrees)
+    return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+
+
+@pytest.mark.parametrize('coupling', [-60.0, 0.0, 100.0])
+@pytest.mark.parametrize(
+    ('axes', 'words'), [([[0, 1], [1, 0]], 'z,x'), ([[0, -1], [-1, 0]], '-z,-x')]
+)
+def test_exchanged_axes_of_force_are_named(coupling: float, axes: ArrayLike, words: str) -> None:
+    """A negative principal stiffness is rejected where k_xx and k_zz are positive or zero."""
+    for matrix in ([[900.0, coupling], [coupling, 600.0]], [[600.0, coupling], [coupling, 600.0]]):
+        recording = pressed(np.array(matrix), grid((1.5,)), noise=1.0)
+        wrong = replace(recording, force=recording.force @ np.array(axes).T)
+        with pytest.raises(WrongSignError, match=f'negative, got k_.* --force-axes {words} it is'):
+            identify_stiffness(wrong)
+
+
+@pytest.mark.parametrize('angle', [90.0, -90.0])
+def test_force_rotated_by_a_right_angle_is_not_a_spring(angle: float) -> None:
+    """The rotation and the axes are named; the curl has its value."""
+    recording = pressed(600.0 * np.eye(2), grid((1.5,)), noise=1.0)
+    found = identify_stiffness(replace(recording, force=recording.force @ rotation(angle).T))
+    (level,) = found.levels
+    assert level.words.startswith('not a spring unless the axes')
+    assert level['axes_rotation'].value == pytest.approx(-np.deg2rad(angle), abs=1e-2)
+    assert 'curl zero' not in level.words
+    assert np.isfinite(level.spring.interval).all()
+    words = '-z,x' if angle > 0.0 else 'z,-x'
+    assert any(f'with --force-axes {words}' in one for one in found.warnings)
+
+
+@pytest.mark.parametrize('angle', [20.0, 40.0, 60.0])
+def test_interval_of_a_rotation_contains_its_asymmetry(angle: float) -> None:
+    """Below and above a ratio of 1, tan of the angle; no axes are advised."""
+    matrix, hits = 600.0 * rotation(angle), 0
+    for seed in range(60):
+        one = identify_stiffness(pressed(matrix, grid((1.5,)), noise=1.0, seed=seed))
+        low, high = one.levels[0].spring.interval
+        hits += low <= np.tan(np.deg2rad(angle)) <= high
+        assert not any('--force-axes' in words for words in one.warnings)
+    # 95 % of 60 less 2.4 standard deviations.
+    assert hits >= 53
+
+
+def test_reasons_of_undetermined_matrices() -> None:
+    """Opposite directions, too few presses, a lag of the force, and forces in mN."""
+    up = np.array([[0.0, 1.5], [0.0, -1.5]])
+    along = pressed(TABLE[1.3], np.tile(up, (4, 1)), noise=1.0)
+    assert any('along one line' in one for one in identify_stiffness(along).warnings)
+    pair = identify_stiffness(pressed(TABLE[1.3], grid((1.3,), [0.0, 1.5]), noise=1.0))
+    assert any('at least 3 presses' in one for one in pair.warnings)
+    whole = pressed(TABLE[1.3], grid((1.3,)), hold=0.6, rest=0.5, noise=1.0)
+    assert not any('clocks' in one for one in identify_stiffness(whole).warnings)
+    late = replace(whole, force=np.roll(whole.force, round(0.3 * RATE), axis=0))
+    lagging = identify_stiffness(late).warnings
+    assert any('the force is 0.30 s behind the motion: clocks differ' in one for one in lagging)
+    with pytest.raises(IdentificationError, match=r'16 presses .* levels .*x\[mN\],z\[mN\]'):
+        identify_stiffness(replace(whole, force=1e3 * whole.force))
