@@ -2,9 +2,10 @@
 r"""
 Likelihood of white and slow noise at any sampling times, and fraction of lost samples.
 
-The errors of each axis are a bias, a term of the delay, white noise of deviation s, and an
-Ornstein-Uhlenbeck process of deviation :math:`s \sqrt g` and correlation time tau. At any sampling
-times, the inverse covariance matrix Q of this process is tridiagonal [Rue2005]_, so that
+The errors of each axis are a bias, terms of the delay and of the position, white noise of
+deviation s, and an Ornstein-Uhlenbeck process of deviation :math:`s \sqrt g` and correlation time
+tau. At any sampling times, the inverse covariance matrix Q of this process is tridiagonal
+[Rue2005]_, so that
 
 .. math:: (I + g Q^{-1})^{-1} = I - g (Q + g I)^{-1}, \qquad
    \log |I + g Q^{-1}| = \log |Q + g I| - \log |Q|
@@ -50,9 +51,9 @@ _NO_BURSTS: Final = ParameterEstimate(name='dropout_time', symbol='T', unit='s')
 
 
 class NoiseFit(NamedTuple):
-    """Noise of k axes, with the constants of the mean: k biases, and the delay if it has one."""
+    """Noise of k axes, with the constants of the mean: k biases, and those of the regressors."""
 
-    constants: FloatArray  #: biases [m], and change of the delay [s]
+    constants: FloatArray  #: biases [m], p of the slopes [s], and m of each axis [1]
     covariance: FloatArray  #: of the constants, for known noise
     log_noise: float  #: logarithm of the deviation of the white noise [m]
     log_ratio: float  #: logarithm of the variance of slow over white noise; -inf: white
@@ -66,13 +67,25 @@ class NoiseFit(NamedTuple):
 class NoiseLikelihood:
     """Likelihood of errors (n, k) [m] of a sensor at times (n,) [s]."""
 
-    def __init__(self, time: FloatArray, errors: FloatArray, slopes: FloatArray | None) -> None:
-        """Slopes (n, k) are the change of the errors by the delay [m/s]; None without a delay."""
-        self._steps, self._axes = np.diff(time), errors.shape[1]
-        ones = np.ones((len(time), 1))
-        parts = [ones, errors] if slopes is None else [ones, errors, slopes]
-        self._columns = np.asfortranarray(np.hstack(parts))
-        self._delayed = slopes is not None
+    def __init__(
+        self,
+        time: FloatArray,
+        errors: FloatArray,
+        slopes: FloatArray | None,
+        regressors: FloatArray | None = None,
+    ) -> None:
+        """Slopes, (n, k) or (p, n, k), have one constant; regressors (n, m) one on each axis."""
+        self._steps, k = np.diff(time), errors.shape[1]
+        shared = np.reshape([] if slopes is None else slopes, (-1, *errors.shape))
+        own = np.empty((len(time), 0)) if regressors is None else regressors
+        ones, p, m = np.ones((len(time), 1)), len(shared), own.shape[1]
+        self._columns = np.asfortranarray(np.hstack([ones, errors, *shared, own]))
+        #: Column of each constant by axis; the last one, of zeros, if it has none.
+        self._places = np.full((k, k + p + k * m), -1)
+        for axis, places in enumerate(self._places):
+            places[axis] = 0
+            places[k : k + p] = 1 + k + k * np.arange(p) + axis
+            places[k + p + axis * m : k + p + (axis + 1) * m] = 1 + k + k * p + np.arange(m)
         step, span = float(np.median(self._steps)), float(time[-1] - time[0])
         #: Correlation times that differ from white noise and from a drift.
         self.times = step, span
@@ -80,17 +93,9 @@ class NoiseLikelihood:
     def fit(self, log_ratio: float, log_time: float) -> NoiseFit:
         """Fit bias, delay and white noise for a ratio of variances and a correlation time."""
         gram, logarithm = self._products(exp(log_ratio), exp(log_time))
-        k = self._axes
+        k, size = self._places.shape
         one, errors = gram[0, 0], gram[1 : k + 1, 1 : k + 1]
-        size = k + self._delayed
-        normal = np.diag(np.full(size, one))
-        right = np.zeros(size)
-        right[:k] = gram[0, 1 : k + 1]
-        if self._delayed:
-            slopes = slice(k + 1, 2 * k + 1)
-            normal[k, :k] = normal[:k, k] = gram[0, slopes]
-            normal[k, k] = np.trace(gram[slopes, slopes])
-            right[k] = np.trace(gram[slopes, 1 : k + 1])
+        normal, right = self._normal(gram)
         inverse = np.linalg.inv(normal)
         constants = inverse @ right
         freedom = k * len(self._columns) - size
@@ -100,6 +105,19 @@ class NoiseLikelihood:
         covariance, information = variance * inverse, float(one * (1.0 + exp(log_ratio)))
         logarithms = 0.5 * log(variance), log_ratio, log_time
         return NoiseFit(constants, covariance, *logarithms, float(deviance), freedom, information)
+
+    def _normal(self, gram: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return matrix and right side of the normal equations from the products."""
+        padded = np.pad(gram, (0, 1))
+        normal = sum(padded[np.ix_(places, places)] for places in self._places)
+        right = sum(padded[places, 1 + axis] for axis, places in enumerate(self._places))
+        return np.asarray(normal), np.asarray(right)
+
+    def condition(self) -> float:
+        """Return the condition number of the normal equations, each constant scaled."""
+        normal, _ = self._normal(self._columns.T @ self._columns)
+        size = np.sqrt(np.diag(normal))
+        return float(np.linalg.cond(normal / np.outer(size, size))) if size.all() else inf
 
     def best(self) -> NoiseFit:
         """Return the most probable noise; white unless slow noise is significant."""

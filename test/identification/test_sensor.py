@@ -505,3 +505,80 @@ def test_axis_that_never_changes_is_named() -> None:
     truth[:, 1] += np.linspace(0.0, 1e-4, len(truth))
     found = identify_sensor(replace(changed(clean, tip), true_tip=truth))
     assert 'positions along y never change: stuck, or not measured' in found.warnings
+
+
+def test_only_the_reversed_axis_is_named_at_rest() -> None:
+    """Exchanging axes with similar true positions gains nothing measurable."""
+    one = recorded(noise=1.8e-4, offset=(1e-3, -5e-4, 2e-3))
+    with pytest.raises(IdentificationError, match='match the true x, -y, z, to'):
+        identify_sensor(changed(one, one.tip * [1.0, -1.0, 1.0]))
+
+
+@pytest.mark.parametrize(('offset', 'words'), [(1.5, '1.5 s later'), (-3.0, '3 s earlier')])
+def test_different_clocks_are_named_and_corrected(offset: float, words: str) -> None:
+    """Noise and bias are as with the same clock; the delay is not determined."""
+    one = recorded(moving=True, noise=1.8e-4, offset=(1e-3, 0.0, 0.0))
+    same = identify_sensor(one)
+    found = identify_sensor(replace(one, true_time=one.true_time - offset))
+    assert any(f'the true position fits {words}: clocks' in line for line in found.warnings)
+    assert not found['delay'].determined
+    assert same['delay'].determined
+    assert not same.warnings
+    # Other samples are covered at the ends: 0.4 um is a tenth of the error of the bias.
+    assert found['bias_x'].value == pytest.approx(same['bias_x'].value, abs=2e-6)
+    assert found['noise'].value == pytest.approx(same['noise'].value, rel=0.02)
+    assert not found['slow_noise'].determined
+
+
+def test_clocks_that_drift_apart_are_named() -> None:
+    """By 75 ms in 75 s; the errors stay white, and the delay is not determined."""
+    one = recorded(moving=True, noise=1.8e-4)
+    found = identify_sensor(replace(one, time=1.001 * one.time))
+    (words,) = (line for line in found.warnings if 'the clock of the tip sensor gains' in line)
+    match = re.search(r'gains ([\d.]+) ms', words)
+    assert match
+    # A standard error of 1 ms.
+    assert float(match[1]) == pytest.approx(75.0, abs=5.0)
+    assert not found['delay'].determined
+    assert not found['slow_noise'].determined
+
+
+@pytest.mark.parametrize('axes', [('x', 'y', 'z'), ('x', 'z')])
+@pytest.mark.parametrize(('scale', 'angle'), [(1.02, 0.0), (1.0, 5.0)])
+def test_error_that_follows_the_true_position_is_named(
+    scale: float, angle: float, axes: tuple[str, ...]
+) -> None:
+    """A scale or rotated axes are no slow noise, and noise and bias are as without them."""
+    whole, columns = recorded(moving=True, noise=1.8e-4), ['xyz'.index(axis) for axis in axes]
+    one = replace(whole, axes=axes, tip=whole.tip[:, columns], true_tip=whole.true_tip[:, columns])
+    clean = identify_sensor(one)
+    cosine, sine = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    turn = np.eye(len(axes))
+    turn[[0, 0, -1, -1], [0, -1, 0, -1]] = cosine, sine, -sine, cosine
+    center = one.true_tip.mean(axis=0)
+    found = identify_sensor(changed(one, center + scale * (one.tip - center) @ turn.T))
+    (words,) = (line for line in found.warnings if 'depends on the true position' in line)
+    assert f'motion along z is measured {scale:.2f}' in words
+    match = re.search(r'along x is .*? turned by ([\d.e-]+) deg', words)
+    assert match
+    # 0.2 mm of noise, 10 mm of motion and 3000 samples: 0.03 deg.
+    assert float(match[1]) == pytest.approx(angle, abs=0.2)
+    assert not found['slow_noise'].determined
+    assert found['noise'].value == pytest.approx(clean['noise'].value, rel=0.03)
+    for axis in axes:
+        low, high = found[f'bias_{axis}'].interval
+        # The mean of the samples differs from that of the path: five standard errors.
+        assert low - 2e-5 < 0.0 < high + 2e-5
+
+
+@pytest.mark.parametrize(('rate', 'is_slow'), [(2.0, False), (0.8, True)])
+def test_a_path_recorded_slowly_is_interpolated_or_named(rate: float, is_slow: bool) -> None:
+    """Motion up to 0.2 Hz at 2 Hz leaves white noise; at 0.8 Hz the rate is named."""
+    one = recorded(moving=True, noise=1.8e-4)
+    time = np.arange(-5.0, 80.0, 1.0 / rate)
+    phases = np.add(np.outer(time, [1.3, 0.7, 1.1]), [0.0, 0.0, 1.6])
+    slow = replace(one, true_time=time, true_tip=HELD + 0.01 * np.sin(phases))
+    found = identify_sensor(slow)
+    named = [line for line in found.warnings if f'recorded at {rate:g} Hz, too slowly' in line]
+    assert len(named) == is_slow
+    assert is_slow or not found['slow_noise'].determined
