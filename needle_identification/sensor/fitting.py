@@ -13,6 +13,7 @@ from math import acos, degrees, exp, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import FloatArray
+from needle_identification.errors import IdentificationError
 from needle_identification.sensor.alignment import DELAYS
 from needle_identification.sensor.noise import NoiseFit, NoiseLikelihood
 from needle_identification.sensor.truth import TruePath
@@ -141,7 +142,14 @@ def _is_clear(constants: FloatArray, covariance: FloatArray, freedom: float) -> 
 def fit_sensor(path: TruePath, time: FloatArray, tip: FloatArray, delay: float) -> SensorFit:
     """Fit bias and noise at times (n,) of positions (n, k); if the tip moves, also the delay."""
     if path.moves:
-        return _Fitter(path, time, tip, delay).final(delay)
+        fitter = _Fitter(path, time, tip, delay)
+        alone = _Terms(drift=False, linear=False)
+        if fitter.likelihood(delay, 0.0, alone).condition() > _SINGULAR:
+            raise IdentificationError(
+                'the true position moves at a constant velocity, which does not separate bias '
+                'and delay: hold the tip, or reverse the motion'
+            )
+        return fitter.final(delay)
     left, k = tip - path.at(time), tip.shape[1]
     noise = NoiseLikelihood(time, left, None).best()
     return SensorFit(

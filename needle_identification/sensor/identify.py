@@ -115,7 +115,10 @@ def identify_sensor(recording: SensorRecording) -> SensorEstimate:
     kept = ~far
     _check_count(one, int(np.count_nonzero(kept)))
     time, tip = time[kept], one.tip[usable][kept]
-    whole = fit_sensor(path, time, tip, delay)
+    try:
+        whole = fit_sensor(path, time, tip, delay)
+    except IdentificationError as cause:
+        raise IdentificationError(f'{one.name}: {cause}') from None
     fit = whole.noise
     dropout, dropout_time = fit_losses(one.time)
     duration, count = float(time[-1] - time[0]), int(np.count_nonzero(far))

@@ -14,6 +14,7 @@ from scipy.interpolate import CubicSpline
 _BUNCHED: Final = 0.25  # interval of rows that come together, over the median interval
 _WIDE: Final = 3.0  # largest interval of every second row, likewise
 _MOVED: Final = 3.0  # smallest motion over the white noise
+_SLOPE: Final = 0.05  # half the interval of a slope, short relative to motions [s]
 _FEWEST: Final = 8  # smallest number of rows whose rate is tested
 
 
@@ -42,7 +43,8 @@ class TruePath:
 
     def slopes(self, time: FloatArray) -> FloatArray:
         """Return the change of the position by a delay at times (n,), (n, k) [m/s]."""
-        step = 0.5 * self.interval
+        # Rows farther apart have independent noise, which a slope of neighbors would amplify.
+        step = max(0.5 * self.interval, _SLOPE)
         return (self.at(time - step) - self.at(time + step)) / (2.0 * step)
 
     def covers(self, first: FloatArray, last: FloatArray) -> BoolArray:

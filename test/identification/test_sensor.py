@@ -582,3 +582,25 @@ def test_a_path_recorded_slowly_is_interpolated_or_named(rate: float, is_slow: b
     named = [line for line in found.warnings if f'recorded at {rate:g} Hz, too slowly' in line]
     assert len(named) == is_slow
     assert is_slow or not found['slow_noise'].determined
+
+
+def test_noise_of_the_true_position_is_no_drift_and_no_delay() -> None:
+    """Slopes of neighboring rows would have its noise, and a delay 8 ms off with 0.2 ms error."""
+    one = recorded(moving=True, noise=1.8e-4)
+    time = np.arange(-2.0, 78.0, 0.01)
+    phases = np.add(np.outer(time, [1.3, 0.7, 1.1]), [0.0, 0.0, 1.6])
+    noise = 3e-4 * np.random.default_rng(2).standard_normal((len(time), 3))
+    path = HELD + 0.01 * np.sin(phases) + noise
+    found = identify_sensor(replace(one, true_time=time, true_tip=path))
+    assert found.warnings == ()
+    # Four standard errors of 0.5 ms.
+    assert found['delay'].value == pytest.approx(0.0, abs=2e-3)
+
+
+def test_a_constant_velocity_does_not_separate_bias_and_delay() -> None:
+    """In one line, as its normal equations are singular."""
+    one = recorded(moving=True, noise=1.8e-4)
+    ramp = np.outer(one.time, [0.0, 1e-3, 0.0])
+    moved = replace(one, tip=one.tip - one.true_tip + ramp, true_tip=ramp)
+    with pytest.raises(IdentificationError, match='constant velocity, which does not separate'):
+        identify_sensor(moved)
