@@ -186,10 +186,8 @@ class PlayerNode(BaseNode):
         try:
             action()
         except NeedleError as error:
-            self._playback.is_ended = self.failed = True
-            self.failure = str(error)
-            self.get_logger().error(self.failure)
-            self.publish_diagnostics()
+            self._playback.is_ended = True
+            self._end(str(error))
 
     def _play(self) -> None:
         deadline = time.monotonic() + _LONGEST_BURST
@@ -208,9 +206,18 @@ class PlayerNode(BaseNode):
         if not playback.is_ended:
             self._reset_clock()
             return
-        report = f'played {self._played} messages of {playback.bag.path}'
-        if playback.bag.losses:
-            self.get_logger().warning('; '.join([report, *playback.bag.losses]))
+        self._end(playback.damage)
+
+    def _end(self, failure: str) -> None:
+        """Report the number of messages played, with the failure or the losses of the bag."""
+        bag = self._playback.bag
+        report = f'played {self._played} messages of {bag.path}'
+        if failure:
+            self.failed = True
+            self.failure = '; '.join([failure, report, *bag.losses])
+            self.get_logger().error(self.failure)
+        elif bag.losses:
+            self.get_logger().warning('; '.join([report, *bag.losses]))
         else:
             self.get_logger().info(report)
         self.publish_diagnostics()

@@ -17,6 +17,9 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 from needle_identification.bags import compression
+from needle_identification.bags.mcap_search import CHUNK as _CHUNK
+from needle_identification.bags.mcap_search import find_record, is_record, PRIVATE, Rereadable
+from needle_identification.bags.mcap_search import HEAD as _HEAD
 from needle_identification.bags.topics import (
     BagTopic,
     LARGEST_BATCH,
@@ -32,8 +35,6 @@ from numpy.typing import NDArray
 
 _MAGIC: Final = b'\x89MCAP0\r\n'
 
-_HEAD: Final = struct.Struct('<BQ')  # opcode and length of a record
-_CHUNK: Final = struct.Struct('<QQQII')  # start, end, size, checksum, length of compression
 _TAIL: Final = struct.Struct('<BQQQI8s')  # the end of a file: a footer record and the magic bytes
 
 #: Header of a message record.
@@ -41,6 +42,9 @@ _MESSAGE: Final = np.dtype(
     [('channel', '<u2'), ('sequence', '<u4'), ('received', '<u8'), ('published', '<u8')]
 )
 _MESSAGE_HEAD: Final = _MESSAGE.itemsize
+
+#: Opcodes of a chunk.
+_IS_MESSAGES: Final = np.isin(np.arange(256), (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE))
 
 _SUMMARY: Final = 2**24  #: largest index that is read, of 80,000 chunks or more [bytes]
 DAMAGED_MCAP: Final = (*compression.DAMAGED, McapError)  #: exceptions for damaged bytes
@@ -130,43 +134,107 @@ def _summary(file: Path) -> bytes:
 
 def mcap_batches(file: Path, tally: Tally) -> Iterator[MessageBatch]:
     """Read an MCAP file, compressed or not; yield the messages of the selected topics."""
-    channels = _Channels()
-    loose = bytearray()
-    is_complete = False
     with compression.open_file(file, tally.budget) as stream:
         magic = compression.read_up_to(stream, len(_MAGIC))
         if magic != _MAGIC:
             begin = repr(magic) if magic else 'nothing'
             raise RecordingError(f'{file.name} is not an MCAP file: begins with {begin}')
-        while len(head := compression.read_up_to(stream, _HEAD.size)) == _HEAD.size:
-            opcode, length = _HEAD.unpack(head)
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
-                if length > tally.budget.largest:
-                    tally.faults.append(f'is damaged: {tally.budget.too_large("record", length)}')
-                    break
-                body = compression.read_up_to(stream, length)
-                if opcode != Opcode.CHUNK:
-                    loose += head + body
-                if loose and (opcode == Opcode.CHUNK or len(loose) > compression.BLOCK):
-                    yield from _batches(bytes(loose), channels, tally)
-                    loose.clear()
-                if opcode == Opcode.CHUNK:
-                    content = _chunk_content(body, length, tally, partial(channels.recover, file))
-                    yield from _batches(content, channels, tally)
-            else:
-                tally.budget.spend(0, compression.COSTLY)
-                first = compression.read_up_to(stream, min(length, 8))
-                if opcode == Opcode.STATISTICS:
-                    tally.written = int.from_bytes(first, 'little')
-                _skip(stream, length - len(first))
-                is_complete |= opcode == Opcode.DATA_END
-            if opcode == Opcode.FOOTER:
-                break
-    yield from _batches(bytes(loose), channels, tally)
-    if not is_complete:
-        tally.faults.insert(0, 'is cut off')
+        yield from _McapReader(file, stream, tally).batches()
     if tally.written not in (None, tally.count):
         tally.faults.append('has lost messages')
+
+
+class _McapReader:
+    """Reads records one by one; after damaged bytes it continues at the next records."""
+
+    def __init__(self, file: Path, stream: Any, tally: Tally) -> None:
+        self._file, self._stream, self._tally = file, Rereadable(stream), tally
+        self._channels = _Channels()
+        #: Records outside of chunks.
+        self._loose = bytearray()
+        #: The last record outside of chunks, which the head of the next record confirms, and the
+        #: bytes from its start on.
+        self._held, self._suspect = b'', bytearray()
+        self._is_complete = False
+
+    def batches(self) -> Iterator[MessageBatch]:
+        tally = self._tally
+        while len(head := compression.read_up_to(self._stream, _HEAD.size)) == _HEAD.size:
+            opcode, length = _HEAD.unpack(head)
+            if is_record(opcode, length) or len(self._suspect) > compression.BLOCK:
+                self._loose += self._held
+                self._held, self._suspect = b'', bytearray()
+            elif opcode < PRIVATE:
+                yield from self._search(head)
+                continue
+            if length > tally.budget.largest and opcode != Opcode.ATTACHMENT:
+                tally.faults.append(f'is damaged: {tally.budget.too_large("record", length)}')
+                yield from self._search(head)
+                continue
+            if opcode == Opcode.CHUNK or len(self._loose) > compression.BLOCK:
+                yield from self._flush()
+            if opcode == Opcode.ATTACHMENT:
+                _skip(self._stream, length)
+                continue
+            body = compression.read_up_to(self._stream, length)
+            yield from self._take(opcode, length, head + body)
+            if opcode == Opcode.FOOTER:
+                break
+        self._loose += self._held
+        yield from self._flush()
+        if not self._is_complete:
+            # After damage the end may have been lost with it.
+            self._tally.faults.insert(0, 'is cut off')
+
+    def _take(self, opcode: int, length: int, record: bytes) -> Iterator[MessageBatch]:
+        body = record[_HEAD.size :]
+        if opcode == Opcode.CHUNK and _is_consistent(body, length):
+            recover = partial(self._channels.recover, self._file)
+            content = _chunk_content(body, length, self._tally, recover)
+            yield from _batches(content, self._channels, self._tally)
+        elif len(body) < length or opcode == Opcode.CHUNK:
+            yield from self._search(record)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            self._held = record
+            self._suspect += record
+        else:
+            self._tally.budget.spend(0, compression.COSTLY)
+            if opcode == Opcode.STATISTICS:
+                self._tally.written = int.from_bytes(body[:8], 'little')
+            if opcode >= PRIVATE:
+                self._suspect += record
+            self._is_complete |= opcode == Opcode.DATA_END
+
+    def _search(self, data: bytes) -> Iterator[MessageBatch]:
+        """Skip to the next records after damage, without the record before the damage."""
+        yield from self._flush()
+        self._channels.recover(self._file)
+        suspect = bytes(self._suspect) + data
+        self._stream.put_back(suspect[1:])
+        skipped = self._stream.find(self._channels.topics, self._tally.budget)
+        if skipped is not None:
+            self._tally.faults.append(_damage(skipped + 1))
+            self._held = b''
+        self._suspect.clear()
+
+    def _flush(self) -> Iterator[MessageBatch]:
+        content = bytes(self._loose)
+        self._loose.clear()
+        yield from _batches(content, self._channels, self._tally)
+
+
+def _damage(size: int) -> str:
+    return f'is damaged: {size} bytes are not readable'
+
+
+def _is_consistent(chunk: bytes, length: int) -> bool:
+    """Return whether the sizes in the head of a chunk add up to its length."""
+    with suppress(struct.error):
+        *_, name_length = _CHUNK.unpack_from(chunk)
+        size_at = _CHUNK.size + name_length
+        (size,) = struct.unpack_from('<Q', chunk, size_at)
+        return bool(size_at + 8 + size == length)
+    return True
 
 
 def _skip(stream: Any, length: int) -> None:
@@ -195,10 +263,12 @@ def _chunk_content(chunk: bytes, length: int, tally: Tally, recover: Callable[[]
     return data
 
 
-def _records(content: bytes) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _records(
+    content: bytes, position: int = 0
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Yield the begin (after the head) and end of complete records, in groups."""
     length_of, head = struct.Struct('<Q').unpack_from, _HEAD.size
-    position, size = 0, len(content)
+    size = len(content)
     is_more = True
     while is_more:
         ends, is_more = array('q', [position]), False
@@ -215,9 +285,42 @@ def _records(content: bytes) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int
         yield table[:-1] + head, table[1:]
 
 
+def _undamaged(
+    content: bytes, channels: _Channels, tally: Tally
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Yield records as `_records`, without damaged bytes and the record before each damage."""
+    data, position, size = np.frombuffer(content, dtype=np.uint8), 0, len(content)
+    while position < size:
+        wrong, after = False, position
+        for begin, end in _records(content, position):
+            # The head of a record, also of an incomplete one, confirms the record before.
+            heads = np.append(begin - _HEAD.size, end[-1:] if len(end) else after)
+            after = int(heads[-1])
+            known = _IS_MESSAGES[data[heads[heads < size]]]
+            known[: len(begin)] &= (end - begin >= _MESSAGE_HEAD) | (
+                data[begin - _HEAD.size] != Opcode.MESSAGE
+            )
+            count = len(begin)
+            if wrong := not known.all():
+                count = max(int(known.argmin()) - 1, 0)
+                after = int(heads[count])
+            yield begin[:count], end[:count]
+            if wrong:
+                break
+        if after >= size:
+            return
+        position, is_found = find_record(
+            content, after + 1, channels.topics, tally.budget, is_end=True
+        )
+        if wrong or is_found:
+            tally.faults.append(_damage((position if is_found else size) - after))
+        if not is_found:
+            return
+
+
 def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[MessageBatch]:
     data = np.frombuffer(content, dtype=np.uint8)
-    for begin, end in _records(content):
+    for begin, end in _undamaged(content, channels, tally):
         opcodes = data[begin - _HEAD.size]
         definitions = np.flatnonzero((opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL))
         tally.budget.spend(0, len(begin) + compression.COSTLY * (1 + len(definitions)))
@@ -226,7 +329,7 @@ def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Mess
             with suppress(*DAMAGED_MCAP):
                 channels.define(opcodes[k], content[begin[k] : end[k]])
         tally.piece += 1
-        is_message = (opcodes == Opcode.MESSAGE) & (end - begin >= _MESSAGE_HEAD)
+        is_message = opcodes == Opcode.MESSAGE
         if not is_message.any():
             continue
         first, after = begin[is_message], end[is_message]

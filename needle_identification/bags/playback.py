@@ -55,6 +55,8 @@ class BagPlayback:
         """Play from the start; raise a RecordingError if there is no message to play."""
         self._rewind()
         self.is_paused, self.is_ended = paused, False
+        #: First damaged receive time that did not end the playback, at rate 0.
+        self.damage = ''
         #: Delay of the last message and largest delay [s], and number of restarts at the end.
         self.late = self.latest = 0.0
         self.loops = 0
@@ -127,16 +129,19 @@ class BagPlayback:
         return self._next is not None
 
     def is_due(self) -> bool:
-        """Whether the next message is due; records its delay, and rejects a pause of a day."""
+        """Whether the next message is due; records its delay, and rejects a wait of a day."""
         if self._next is None:
             return False
         pause = self._next.received - self._last
         if pause > _LONGEST_PAUSE:
             days, name = pause / _LONGEST_PAUSE, self._next.topic.name
-            raise RecordingError(
+            damage = (
                 f'{self.bag.path} has a damaged receive time at {self.seconds(self._last):.3f} s: '
                 f'a message of {name} arrives {days:.3g} days later'
             )
+            if self.settings.rate > 0.0:
+                raise RecordingError(damage)
+            self.damage = self.damage or damage
         if self.settings.rate > 0.0:
             late = self.position - self._next.received
             if late < 0:

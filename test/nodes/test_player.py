@@ -512,6 +512,22 @@ def test_process_ends_after_delivery(ros_graph: RosGraph, tmp_path: Path) -> Non
     assert listener.of('text') == bytes_of(bag, '/text')
 
 
+@pytest.mark.parametrize(('rate', 'count'), [(0.0, 3), (1.0, 2)])
+def test_process_fails_at_a_damaged_receive_time(
+    ros_graph: RosGraph, tmp_path: Path, rate: float, count: int
+) -> None:
+    """Exit status 1 and the number of messages played: all at rate 0, else those before."""
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.add_topic('/text', 'std_msgs/msg/String')
+        for late in (0, 1, 10**18):
+            bag.write('/text', text('any'), EPOCH + late)
+    with process(ros_graph, tmp_path / 'bag', f'rate:={rate}', 'delay:=0.0') as player:
+        _, said = player.communicate(timeout=60.0)
+    assert player.returncode == 1, said
+    assert 'has a damaged receive time at 0.000 s' in said
+    assert f'played {count} messages of {tmp_path / "bag"}' in said
+
+
 def test_process_continues_without_exit_at_end(ros_graph: RosGraph, tmp_path: Path) -> None:
     """Latched messages stay available; SIGINT ends the process with status 0."""
     bag = small_bag(tmp_path / 'bag')
