@@ -21,7 +21,7 @@ from needle_dynamics.modes import mode_shapes
 from needle_dynamics.parameters import NeedleParameters
 from needle_dynamics.simulated.integrator import checked_step, DEFAULT_STEP
 from needle_dynamics.simulated.needle_array import columns_of, NeedleArray
-from needle_dynamics.simulated.trajectory import count_of, refined
+from needle_dynamics.simulated.trajectory import count_of, LEAST_TOLERANCE, refined
 from needle_ros.errors import ParameterError, ShapeError
 from needle_ros.process import cores
 from needle_ros.settings import checked, is_whole
@@ -173,7 +173,7 @@ def simulate_batch(
     if tolerance is not None and (step is not None or graded):
         raise ParameterError('tolerance excludes step and graded')
     if tolerance is not None:
-        checked('tolerance', tolerance, low=0.0, open_low=True)
+        checked('tolerance', tolerance, low=LEAST_TOLERANCE)
     step = checked_step(DEFAULT_STEP if step is None else step)
     _check(each, starts)
     inputs = lanes.BatchTrajectory(pushes, turns, count, float(interval), step, graded)

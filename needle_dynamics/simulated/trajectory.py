@@ -23,7 +23,10 @@ from numpy.typing import ArrayLike
 
 DEFAULT_TOLERANCE: Final = 1e-3  #: default tolerance of a run, as in `Trajectory.error`
 DEFAULT_SAMPLES: Final = 2000  #: default number of samples of a run
-_MOST_INTERVALS: Final = 100_000_000  #: largest number of intervals of a run, limited by memory
+_MOST_INTERVALS: Final = 10_000_000  #: largest number of intervals of a run, limited by memory
+
+#: Smallest tolerance: smaller differences are of rounding.
+LEAST_TOLERANCE: Final = 1e-11
 
 #: Least travel for relative errors, as a fraction of the needle length.
 _LEAST_TRAVEL: Final = 1e-4
@@ -134,7 +137,7 @@ def simulate(
         Time between samples [s]; by default 2000 samples. Required if the force is a function of
         time.
     tolerance : float, optional
-        Largest `Trajectory.error`, by default 1e-3.
+        Largest `Trajectory.error`, by default 1e-3, at least 1e-11.
     step : float, optional
         Longest step of the integrator [s], instead of a tolerance: a single run, as in
         `Integrator` and `simulate_batch`.
@@ -184,7 +187,7 @@ def simulate(
             f'got {order!r} and {parameters.friction_law}'
         )
     tolerance = DEFAULT_TOLERANCE if tolerance is None else tolerance
-    checked('tolerance', tolerance, low=0.0, open_low=True)
+    checked('tolerance', tolerance, low=LEAST_TOLERANCE)
     if interval is None:
         if callable(force):
             raise ParameterError('interval must be given with a force that is a function of time')

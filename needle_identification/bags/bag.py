@@ -76,6 +76,9 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
     if not chosen:
         other = min(path.glob(f'*/{METADATA}'), default=None)
         hint = _VALID if other is None else f'name those inside, such as {other.parent}'
+        with suppress(OSError, DocumentError, UnicodeDecodeError, KeyError, TypeError):
+            if listed := _metadata(path)[0]:
+                raise RecordingError(f'{path} holds no recording: {", ".join(listed)} is missing')
         raise RecordingError(f'{path} holds no recording; {hint}')
     names, losses = None, [f'no readable {METADATA}: the recording was not closed']
     try:
@@ -90,7 +93,7 @@ def files_of(path: Path) -> tuple[list[Path], list[str]]:
         if len(recordings_among(chosen, by_time=by_time)) > 1:
             several = f'{path} holds several recordings; name them, such as {chosen[0]}'
             raise RecordingError('; '.join([several, *([] if by_time else losses)]))
-        return chosen, losses
+        return chosen, [*losses, *_missing_parts(chosen)]
     there = {file.name for file in chosen}
     losses = [f'the recorder lost {lost}'] if lost else []
     losses += [f'{name} is missing' for name in names if name not in there]
@@ -116,6 +119,21 @@ def recordings_among(files: Iterable[Path], *, by_time: bool = True) -> list[lis
         joined = len(parts) == 1 or not by_time or _continue(parts)
         groups += [parts] if joined else [[part] for part in parts]
     return groups
+
+
+def _missing_parts(parts: Sequence[Path]) -> list[str]:
+    """Return a line for each part of a split recording that its numbers lack."""
+    numbered = re.compile(r'(.*_)(\d+)')
+    found = [numbered.fullmatch(_uncompressed(part).stem) for part in parts]
+    if len(parts) < 2 or not all(found):
+        return []
+    numbers = {int(match[2]): match[1] for match in found if match}
+    stem = numbers[min(numbers)]
+    gaps = ((low + 1, high - 1) for low, high in pairwise(sorted(numbers)) if high > low + 1)
+    return [
+        f'{stem}{low} is missing' if low == high else f'{stem}{low} to {stem}{high} are missing'
+        for low, high in gaps
+    ]
 
 
 def _in_order(files: Iterable[Path]) -> list[Path]:

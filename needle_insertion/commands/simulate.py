@@ -65,7 +65,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = partial(common.add_quantity, parser)
     add('--depth', 'm', f'insertion depth at the start (default {1e3 * _DEPTH:g}mm; steering: 0)')
     add('--force', 'N', f'insertion force (default {_FORCE:g}N)')
-    add('--duration', 's', 'time to simulate (default: until the hub is at the skin)')
+    add(
+        '--duration',
+        's',
+        'time to simulate (default: until the hub is at the skin, or up to twice as long)',
+    )
     add('--interval', 's', f'time between samples (default {DEFAULT_SAMPLES} samples, or 1 mm)')
     add('--tolerance', '1', f'change when the step is halved (default {DEFAULT_TOLERANCE:g})')
     start = parser.add_mutually_exclusive_group()

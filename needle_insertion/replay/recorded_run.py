@@ -77,6 +77,14 @@ def recorded_runs(path: Path) -> list[RecordedRun]:
         # Raises the error of a bag without messages.
         bag.topics()
         lacking = 'holds no parameters of a plant; record /plant/configuration with the rest'
+        unreadable = [
+            name
+            for name, found in messages.items()
+            if name.endswith('/configuration')
+            and not any(parameters_by_node(message.data) for _, message in found)
+        ]
+        if unreadable:
+            lacking = f'holds no parameters: {", ".join(unreadable)} cannot be read as parameters'
         raise RecordingError('; '.join([f'{path} {lacking}', *losses]))
     return runs
 
@@ -236,7 +244,8 @@ class RecordedRun:
             found.append((received, Event(TRAJECTORY, content)))
         for (_, old), (received, new) in pairwise(configurations):
             changes = {name: new[name] for name in new if new[name] != old.get(name)}
-            found.append((received, Event(PARAMETERS, changes)))
+            if changes:
+                found.append((received, Event(PARAMETERS, changes)))
         for received, event in sorted(found, key=lambda each: each[0]):
             yield self._newest(received) + 1, event
 
@@ -246,6 +255,10 @@ class RecordedRun:
                 f'{self.name}/events is not in the bag: trajectories and changes of parameters '
                 'are assumed to apply from the sample after they were recorded'
             )
+        for name, rows in self.rows.items():
+            repeated = len(rows.stamps) - len(np.unique(rows.stamps))
+            if repeated:
+                yield f'{repeated} of {len(rows.stamps)} messages of {name} repeat a stamp'
         missing = [topic for topic in self.topics if topic not in self.rows]
         if missing:
             yield f'not in the bag: {", ".join(missing)}'

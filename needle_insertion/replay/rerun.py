@@ -2,7 +2,8 @@
 """Recompute a recorded run sample by sample, and compare it with the recording."""
 
 from dataclasses import dataclass
-from math import ceil, isnan
+from itertools import pairwise
+from math import ceil, inf, isnan
 from pathlib import Path
 from typing import Any, Final
 
@@ -227,8 +228,13 @@ class Rerun:
             'all other messages are as computed: one was altered in transit or in the bag': (
                 sum(differing.values()) == 1
             ),
+            self._unknown_pause(): True,
             'the bag holds no wrench_command and no joint_commands: record them with the rest': (
                 self._unknown and not recorded.commands
+            ),
+            'the motion is as computed: the seed or the constants of a sensor differ': (
+                len(wrong - {contract.BASE_WRENCH.name, contract.TIP_DEFLECTION.name}) == 0
+                and len(differing) > len(wrong)
             ),
             'the bag holds no joint_trajectory: record it with the rest': (
                 not simulated and not kinds & {run.MOTION, run.TRAJECTORY}
@@ -237,13 +243,22 @@ class Rerun:
                 simulated and start > 1
             ),
             'which command acted is not in the bag': self._unknown,
-            'the motion is as computed: the seed or the constants of a sensor differ': (
-                len(wrong - {contract.BASE_WRENCH.name, contract.TIP_DEFLECTION.name}) == 0
-                and len(differing) > len(wrong)
-            ),
         }
-        given = (words for words, holds in reasons.items() if holds)
+        given = (words for words, holds in reasons.items() if words and holds)
         return next(given, 'the plant was of another version, or its parameters differ')
+
+    def _unknown_pause(self) -> str:
+        """Return samples before the first difference that a pause may have left out, or ''."""
+        recorded, first = self.recorded, int((self.first or {'sample': 0})['sample'])
+        # Later events are not in a truncated bag; a pause before the last event is known.
+        known = max(recorded.events, default=inf)
+        for before, after in pairwise(recorded.numbers):
+            if known <= before and after - before > 1 and after <= first:
+                return (
+                    f'samples {before + 1} to {after - 1} are missing after the last message of '
+                    f'{recorded.name}/events: the plant may have paused there'
+                )
+        return ''
 
 
 def verify(path: Path, tolerance: float = TOLERANCE) -> list[Rerun]:

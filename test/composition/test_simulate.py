@@ -67,7 +67,7 @@ def test_json_contains_the_summary(capsys: pytest.CaptureFixture[str]) -> None:
         (['--depth', '0.3'], 'insertion depth 0.3 m is outside'),
         (['--interval', '0'], 'interval must be finite, > 0 s, got 0'),
         (['-o', 'run.xlsx'], 'output must be .csv, .png or a folder'),
-        (['--tolerance', '-1'], 'tolerance must be finite, > 0'),
+        (['--tolerance', '-1'], 'tolerance must be finite, >= 1e-11'),
         (['--tip-deflection', '5'], 'tip_deflection must be finite, >= -0.2 and <= 0.2 m, got 5'),
     ],
 )

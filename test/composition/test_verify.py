@@ -420,6 +420,12 @@ def test_pauses_are_distinguished_from_lost_samples(tmp_path: Path) -> None:
     result = only(written(tmp_path / 'bag', shifted))
     exact(result)
     assert result.notes[-1] == 'time was paused, or samples were given up, before sample 81'
+    # A truncated bag may lack the event.
+    cut = only(written(tmp_path / 'cut', shifted[1:]))
+    assert cut.reason == (
+        'samples 81 to 130 are missing after the last message of /plant/events: the plant may '
+        'have paused there'
+    )
 
 
 def test_tare_and_reset_are_replayed(tmp_path: Path) -> None:
@@ -538,7 +544,38 @@ def test_changed_seeds_are_distinguished_from_changed_motion(tmp_path: Path) -> 
     result = only(written(tmp_path / 'bag', as_if(simulated(), seed=8)))
     assert result.verdict == 'differs'
     assert result.topics['/joint_states'].verdict == 'identical'
-    assert result.reason.startswith('the motion is as computed: the seed or the constants')
+    reason = 'the motion is as computed: the seed or the constants of a sensor differ'
+    assert result.reason == reason
+    # At rest, a robot needs no joint_trajectory.
+    kinds = '/joint_trajectory', '/plant/events'
+    rest = [m for m in carried(SAMPLES + 1, SAMPLES + 1) if m.topic not in kinds]
+    result = only(written(tmp_path / 'rest', as_if(rest, mode='robot', seed=8)))
+    assert result.topics['/joint_states'].verdict == 'identical'
+    assert result.reason == reason
+
+
+def test_repeated_messages_are_counted(tmp_path: Path) -> None:
+    """Equal configurations are no change of parameters."""
+    once = without_events(carried(40, 40))
+    result = only(written(tmp_path / 'bag', [one for m in once for one in (m, m)]))
+    number = sum(m.topic == '/joint_states' for m in once)
+    assert f'{number} of {2 * number} messages of /joint_states repeat a stamp' in result.notes
+    assert not any('changed before' in note for note in result.notes)
+
+
+@pytest.mark.parametrize('content', ['{not json', '', '[1, 2]'])
+def test_unreadable_parameters_are_named(tmp_path: Path, content: str) -> None:
+    messages = [m for m in simulated() if m.topic != '/plant/configuration']
+    messages.append(
+        Message(
+            '/plant/configuration',
+            stamp(1),
+            0,
+            encode(message_type('std_msgs/msg/String')(content)),
+        )
+    )
+    with pytest.raises(RecordingError, match='/plant/configuration cannot be read as parameters'):
+        verify(written(tmp_path / 'bag', messages))
 
 
 def test_unknown_constants_are_reported(tmp_path: Path) -> None:

@@ -16,7 +16,12 @@ from needle_dynamics import (
     ToleranceError,
     Trajectory,
 )
-from needle_dynamics.simulated.trajectory import DEFAULT_SAMPLES, DEFAULT_TOLERANCE, ORDERS
+from needle_dynamics.simulated.trajectory import (
+    DEFAULT_SAMPLES,
+    DEFAULT_TOLERANCE,
+    ORDERS,
+    refined,
+)
 import numpy as np
 import pytest
 
@@ -226,11 +231,21 @@ def test_given_step_matches_the_integrator_bit_for_bit() -> None:
 
 
 def test_tolerance_below_rounding_is_rejected() -> None:
-    """The error message contains the best reachable tolerance."""
+    """Without a run; a larger tolerance that a run cannot meet is named with the best."""
     p = preset('paper_si')
     start = NeedleModel(p).state_at(0.05, 1e-3)
-    with pytest.raises(ToleranceError, match=r'tolerance 1e-15 cannot be met .*; the best is'):
+    with pytest.raises(ParameterError, match='tolerance must be finite, >= 1e-11, got 1e-15'):
         simulate(p, start, 3.0, duration=1e-3, interval=1e-3, tolerance=1e-15)
+    with pytest.raises(ToleranceError, match=r'tolerance 1e-15 cannot be met .*; the best is'):
+        refined(NeedleModel(p), start, np.array([3.0]), np.zeros(1), 1e-3, 1e-15)
+
+
+def test_too_many_intervals_are_rejected() -> None:
+    """Before the memory of the samples is requested."""
+    p = preset('phantom')
+    start = NeedleModel(p).state_at(0.05, 1e-3)
+    with pytest.raises(ParameterError, match=r'duration must be at most 1e\+07 intervals'):
+        simulate(p, start, 3.0, duration=9.0, interval=1e-7)
 
 
 def test_leaving_the_depth_range_raises_the_error_of_the_integrator() -> None:
@@ -245,7 +260,7 @@ def test_leaving_the_depth_range_raises_the_error_of_the_integrator() -> None:
     ('options', 'complaint'),
     [
         ({'tolerance': 1e-3, 'step': 1e-5}, 'tolerance and step exclude each other'),
-        ({'tolerance': 0.0}, 'tolerance must be finite, > 0'),
+        ({'tolerance': 0.0}, 'tolerance must be finite, >= 1e-11'),
         ({'graded': True}, 'graded and order require a step'),
         ({'order': 4}, 'graded and order require a step'),
         ({'step': 1e-5, 'order': 3}, 'order must be one of 2, 4, 6, 8, got 3'),

@@ -150,7 +150,7 @@ def test_tolerance_with_torques_and_with_a_run_that_ends_early() -> None:
     [
         ({'tolerance': 1e-4, 'step': 1e-5}, 'tolerance excludes step and graded'),
         ({'tolerance': 1e-4, 'graded': True}, 'tolerance excludes step and graded'),
-        ({'tolerance': 0.0}, r'tolerance must be finite, > 0, got 0\.0'),
+        ({'tolerance': 0.0}, r'tolerance must be finite, >= 1e-11, got 0\.0'),
     ],
 )
 def test_invalid_tolerance_is_rejected(options: dict[str, Any], complaint: str) -> None:

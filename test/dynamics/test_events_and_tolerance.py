@@ -284,7 +284,7 @@ def test_tolerance_is_met_through_rest_and_impact() -> None:
 
 @pytest.mark.parametrize('tolerance', [0.0, -1e-6, np.nan, np.inf])
 def test_tolerance_must_be_positive_and_finite(tolerance: float) -> None:
-    with pytest.raises(ParameterError, match='tolerance must be finite, > 0, got'):
+    with pytest.raises(ParameterError, match='tolerance must be finite, >= 1e-11, got'):
         run(tolerance=tolerance)
 
 

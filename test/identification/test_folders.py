@@ -105,3 +105,18 @@ def test_a_crashed_recording_is_one_recording(tmp_path: Path, suffix: str) -> No
     assert recordings_in(folder) == [folder]
     last.write_bytes(b'')
     assert recordings_in(folder) == [folder]
+
+
+def test_missing_parts_of_a_recording_are_named(tmp_path: Path) -> None:
+    """By the metadata, or by the numbers of the parts without metadata."""
+    for number in (0, 2, 5):
+        start = LENGTH * [0, 2, 5].index(number)
+        data_file(tmp_path / 'split' / f'run_{number}.mcap', start)
+    (tmp_path / 'split' / 'metadata.yaml').unlink(missing_ok=True)
+    assert Bag(tmp_path / 'split').losses[1:] == ['run_1 is missing', 'run_3 to run_4 are missing']
+    (tmp_path / 'gone').mkdir()
+    (tmp_path / 'gone' / 'metadata.yaml').write_text(
+        'rosbag2_bagfile_information: {relative_file_paths: [a_0.mcap]}', encoding='utf-8'
+    )
+    with pytest.raises(RecordingError, match=r'gone holds no recording: a_0\.mcap is missing'):
+        Bag(tmp_path / 'gone')
