@@ -320,10 +320,12 @@ def _undamaged(
 
 def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[MessageBatch]:
     data = np.frombuffer(content, dtype=np.uint8)
+    # A chunk without records counts, too.
+    tally.budget.spend(0, compression.COSTLY)
     for begin, end in _undamaged(content, channels, tally):
         opcodes = data[begin - _HEAD.size]
         definitions = np.flatnonzero((opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL))
-        tally.budget.spend(0, len(begin) + compression.COSTLY * (1 + len(definitions)))
+        tally.budget.spend(0, len(begin) + compression.COSTLY * len(definitions))
         for k in definitions:
             # Messages of an unreadable channel are counted as of an unknown topic.
             with suppress(*DAMAGED_MCAP):
