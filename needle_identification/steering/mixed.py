@@ -44,7 +44,7 @@ _RESPONSES: Final = (0.0, 0.5, 2.0, 8.0)
 
 #: Grid of the deviation of the error at the skin over that of the path noise.
 _ENTRIES: Final = (0.0, 2.0)
-_SHALLOW: Final = 0.02  # depth over which this error decays [m]
+_SHALLOW: Final = 0.01  # depth over which this error decays [m]
 _CORRELATED: Final = 5e-3  # depth over which it is correlated [m]
 
 _FINEST: Final = 1e-6  # smallest deviation of the white noise [m]
