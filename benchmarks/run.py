@@ -45,7 +45,7 @@ MODULES = {
 }
 
 #: Arguments of each benchmark with a page, which ``python -m benchmarks.run FOLDER`` makes.
-PAGES: Final = {name: '' for name in MODULES if name not in ('damage', 'pool')} | {
+PAGES: Final = {name: '' for name in MODULES if name not in ('damage', 'pool', 'steering-fit')} | {
     'calibration': '--recordings 300'
 }
 

@@ -33,7 +33,6 @@ _USUAL: Final = {
     'tip_z': ('tipz', 'z', 'pz', 'pointz', 'positionz'),
 }
 
-_LATEST: Final = 9e9  # largest time whose nanoseconds are 64-bit integers [s]
 _AVERAGED: Final = 1.5  # messages per sample above which samples are means
 
 
@@ -121,8 +120,6 @@ def _positions(
     )
     rows = np.column_stack(tips)
     start, stamps, found = tables.sorted_rows(path, times, rows, losses)
-    if not abs(start) < _LATEST:
-        raise RecordingError(f'{path}: time starts at {start:.3g} s: is its unit right?')
     _check_means(losses, int(np.count_nonzero(np.isfinite(rows).all(axis=1))), len(stamps))
     return round(NANOSECONDS * start) + stamps, found, losses
 
