@@ -11,7 +11,8 @@ the needle, with a confidence interval.
 # A recording as your rig may write it
 # ------------------------------------
 # This cell writes a table from a recording of the clone: time in ms, position of a stage in mm
-# that increases *out of* the tissue, force in N. Replace it by your own file.
+# that increases *out of* the tissue, force in N. Replace it by your own file. `BAGS` is the folder
+# `bags` of the clone; with a notebook from elsewhere, set its path.
 
 from pathlib import Path
 from tempfile import gettempdir
@@ -25,7 +26,7 @@ from needle_identification import (
 )
 import numpy as np
 
-BAGS = Path('../../bags')
+BAGS = next((one for one in map(Path, ('bags', '../../bags')) if one.is_dir()), Path('bags'))
 
 bag = read_friction_recording(BAGS / 'friction_01')
 table = Path(gettempdir(), 'stage.csv')
