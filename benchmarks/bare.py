@@ -102,7 +102,7 @@ class Sender:
         return left
 
 
-class Template:
+class BytesTemplate:
     """Serialized message whose time and groups of numbers, distinct at first, are replaced."""
 
     def __init__(self, message: Any, *groups: tuple[float, ...]) -> None:
@@ -132,28 +132,28 @@ _STAMP: Final = slice(4, 12)
 _FORCE: Final = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
 
-def _wrench() -> Template:
+def _wrench() -> BytesTemplate:
     message = WrenchStamped()
     message.header.frame_id = 'needle_base'
     force, torque = message.wrench.force, message.wrench.torque
     force.x, force.y, force.z, torque.x, torque.y, torque.z = _FORCE
-    return Template(message, _FORCE)
+    return BytesTemplate(message, _FORCE)
 
 
-def _point() -> Template:
+def _point() -> BytesTemplate:
     message = PointStamped()
     message.header.frame_id = 'needle_entry'
     message.point.x, message.point.y, message.point.z = 1.0, 2.0, 3.0
-    return Template(message, (1.0, 2.0, 3.0))
+    return BytesTemplate(message, (1.0, 2.0, 3.0))
 
 
-def _joint_state(*names: str, effort: bool = False) -> Template:
+def _joint_state(*names: str, effort: bool = False) -> BytesTemplate:
     count = len(names)
     groups = [tuple(float(count * k + i + 1) for i in range(count)) for k in range(3)]
     message = JointState(name=names, position=groups[0], velocity=groups[1])
     if effort:
         message.effort = groups[2]
-    return Template(message, *groups[: 2 + effort])
+    return BytesTemplate(message, *groups[: 2 + effort])
 
 
 class BytesSender:
