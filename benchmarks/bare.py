@@ -239,22 +239,41 @@ class BytesPlant(Clocked):
         self._force = self._template.read(data)[1]
 
 
-class BareEcho(Node):
-    """Responds to each ``joint_states`` with the messages of the controller, the command first."""
+class Echo(Node, ABC):
+    """Subscribes to the measurements, and publishes command, reference and error."""
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, *, raw: bool, **options: Any) -> None:
         super().__init__('bare_echo', **options)
         self._command = self.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
         self._reference = self.create_publisher(JointState, 'reference', SENSOR)
         self._error = self.create_publisher(JointState, 'tracking_error', SENSOR)
         self._seen = 0.0
+        for kind, topic, take in (
+            (PointStamped, 'tip_deflection', self._on_tip),
+            (WrenchStamped, 'base_wrench', self._on_wrench),
+            (JointState, 'joint_states', self._on_joint_states),
+        ):
+            self.create_subscription(kind, topic, take, SENSOR, raw=raw)
+
+    @abstractmethod
+    def _on_tip(self, message: Any) -> None: ...
+
+    @abstractmethod
+    def _on_wrench(self, message: Any) -> None: ...
+
+    @abstractmethod
+    def _on_joint_states(self, message: Any) -> None: ...
+
+
+class BareEcho(Echo):
+    """Responds to each ``joint_states`` with the messages of the controller, the command first."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(raw=False, **options)
         self._wrench = WrenchStamped()
         self._wrench.header.frame_id = 'needle_base'
         self._aim = JointState(name=['insertion'])
         self._off = JointState(name=['insertion'])
-        self.create_subscription(PointStamped, 'tip_deflection', self._on_tip, SENSOR)
-        self.create_subscription(WrenchStamped, 'base_wrench', self._on_wrench, SENSOR)
-        self.create_subscription(JointState, 'joint_states', self._on_joint_states, SENSOR)
 
     def _on_tip(self, message: PointStamped) -> None:
         self._seen = message.point.z
@@ -275,23 +294,13 @@ class BareEcho(Node):
         self._error.publish(off)
 
 
-class BytesEcho(Node):
+class BytesEcho(Echo):
     """`BareEcho` with serialized messages."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__('bare_echo', **options)
-        self._command = self.create_publisher(WrenchStamped, 'wrench_command', COMMAND)
-        self._reference = self.create_publisher(JointState, 'reference', SENSOR)
-        self._error = self.create_publisher(JointState, 'tracking_error', SENSOR)
-        self._seen = 0.0
+        super().__init__(raw=True, **options)
         self._wrench, self._tip, self._aim = _wrench(), _point(), _joint_state('insertion')
         self._joints = _joint_state('insertion', 'rotation', effort=True)
-        for kind, topic, take in (
-            (PointStamped, 'tip_deflection', self._on_tip),
-            (WrenchStamped, 'base_wrench', self._on_wrench),
-            (JointState, 'joint_states', self._on_joint_states),
-        ):
-            self.create_subscription(kind, topic, take, SENSOR, raw=True)
 
     def _on_tip(self, data: bytes) -> None:
         self._seen = self._tip.read(data)[2]

@@ -17,9 +17,14 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
 from needle_identification.bags import compression
-from needle_identification.bags.mcap_search import CHUNK as _CHUNK
-from needle_identification.bags.mcap_search import find_record, is_record, PRIVATE, Rereadable
-from needle_identification.bags.mcap_search import HEAD as _HEAD
+from needle_identification.bags.mcap_search import (
+    CHUNK,
+    find_record,
+    HEAD,
+    is_record,
+    PRIVATE,
+    Rereadable,
+)
 from needle_identification.bags.topics import (
     BagTopic,
     LARGEST_BATCH,
@@ -86,7 +91,7 @@ class _Channels:
         summary = _summary(file)
         for begin, end in _records(summary):
             for first, after in zip(begin.tolist(), end.tolist(), strict=True):
-                self.define(summary[first - _HEAD.size], summary[first:after])
+                self.define(summary[first - HEAD.size], summary[first:after])
 
 
 def indexed_topics(file: Path) -> set[BagTopic] | None:
@@ -108,8 +113,8 @@ def indexed_span(file: Path) -> tuple[int, int] | None:
     with suppress(*DAMAGED_MCAP):
         for begin, end in _records(summary):
             for first, after in zip(begin.tolist(), end.tolist(), strict=True):
-                if summary[first - _HEAD.size] == Opcode.STATISTICS:
-                    stream = ReadDataStream(BytesIO(summary[first - _HEAD.size : after]))
+                if summary[first - HEAD.size] == Opcode.STATISTICS:
+                    stream = ReadDataStream(BytesIO(summary[first - HEAD.size : after]))
                     found = Statistics.read(stream)
                     if found.message_count:
                         return found.message_start_time, found.message_end_time
@@ -159,8 +164,8 @@ class _McapReader:
 
     def batches(self) -> Iterator[MessageBatch]:
         tally = self._tally
-        while len(head := compression.read_up_to(self._stream, _HEAD.size)) == _HEAD.size:
-            opcode, length = _HEAD.unpack(head)
+        while len(head := compression.read_up_to(self._stream, HEAD.size)) == HEAD.size:
+            opcode, length = HEAD.unpack(head)
             if is_record(opcode, length) or len(self._suspect) > compression.BLOCK:
                 self._loose += self._held
                 self._held, self._suspect = b'', bytearray()
@@ -187,7 +192,7 @@ class _McapReader:
             self._tally.faults.insert(0, 'is cut off')
 
     def _take(self, opcode: int, length: int, record: bytes) -> Iterator[MessageBatch]:
-        body = record[_HEAD.size :]
+        body = record[HEAD.size :]
         if opcode == Opcode.CHUNK and _is_consistent(body, length):
             recover = partial(self._channels.recover, self._file)
             content = _chunk_content(body, length, self._tally, recover)
@@ -230,8 +235,8 @@ def _damage(size: int) -> str:
 def _is_consistent(chunk: bytes, length: int) -> bool:
     """Return whether the sizes in the head of a chunk add up to its length."""
     with suppress(struct.error):
-        *_, name_length = _CHUNK.unpack_from(chunk)
-        size_at = _CHUNK.size + name_length
+        *_, name_length = CHUNK.unpack_from(chunk)
+        size_at = CHUNK.size + name_length
         (size,) = struct.unpack_from('<Q', chunk, size_at)
         return bool(size_at + 8 + size == length)
     return True
@@ -245,11 +250,11 @@ def _skip(stream: Any, length: int) -> None:
 def _chunk_content(chunk: bytes, length: int, tally: Tally, recover: Callable[[], None]) -> bytes:
     """Return the records of a chunk: all available if truncated, none if damaged (`recover`)."""
     try:
-        _, _, size, checksum, name_length = _CHUNK.unpack_from(chunk)
-        begin = _CHUNK.size + name_length + 8
+        _, _, size, checksum, name_length = CHUNK.unpack_from(chunk)
+        begin = CHUNK.size + name_length + 8
         if size > tally.budget.largest:
             raise ValueError(tally.budget.too_large('chunk', size))
-        data = compression.decompress(chunk[_CHUNK.size : begin - 8].decode(), chunk[begin:], size)
+        data = compression.decompress(chunk[CHUNK.size : begin - 8].decode(), chunk[begin:], size)
         tally.budget.spend(len(data))
         if len(chunk) == length:
             if len(data) != size:
@@ -267,7 +272,7 @@ def _records(
     content: bytes, position: int = 0
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Yield the begin (after the head) and end of complete records, in groups."""
-    length_of, head = struct.Struct('<Q').unpack_from, _HEAD.size
+    length_of, head = struct.Struct('<Q').unpack_from, HEAD.size
     size = len(content)
     is_more = True
     while is_more:
@@ -294,11 +299,11 @@ def _undamaged(
         wrong, after = False, position
         for begin, end in _records(content, position):
             # The head of a record, also of an incomplete one, confirms the record before.
-            heads = np.append(begin - _HEAD.size, end[-1:] if len(end) else after)
+            heads = np.append(begin - HEAD.size, end[-1:] if len(end) else after)
             after = int(heads[-1])
             known = _IS_MESSAGES[data[heads[heads < size]]]
             known[: len(begin)] &= (end - begin >= _MESSAGE_HEAD) | (
-                data[begin - _HEAD.size] != Opcode.MESSAGE
+                data[begin - HEAD.size] != Opcode.MESSAGE
             )
             count = len(begin)
             if wrong := not known.all():
@@ -323,7 +328,7 @@ def _batches(content: bytes, channels: _Channels, tally: Tally) -> Iterator[Mess
     # A chunk without records counts, too.
     tally.budget.spend(0, compression.COSTLY)
     for begin, end in _undamaged(content, channels, tally):
-        opcodes = data[begin - _HEAD.size]
+        opcodes = data[begin - HEAD.size]
         definitions = np.flatnonzero((opcodes == Opcode.SCHEMA) | (opcodes == Opcode.CHANNEL))
         tally.budget.spend(0, len(begin) + compression.COSTLY * len(definitions))
         for k in definitions:

@@ -63,13 +63,12 @@ def clock_offset(one: SensorRecording, path: TruePath) -> float:
     best = float(wide[left.argmin()])
     if within[left.argmin()]:
         return 0.0
-    fine = np.concatenate(
-        [np.arange(best - _STEP, best + _STEP, _GRID), np.arange(*DELAYS, _GRID)]
-    )
-    left, count = unexplained(fine), len(fine) - len(np.arange(*DELAYS, _GRID))
-    found = int(left[:count].argmin())
-    is_better = left[found] < min(_BETTER * left[count:].min(), _UNEXPLAINED)
-    return float(fine[found]) if is_better else 0.0
+    others, usual = np.arange(best - _STEP, best + _STEP, _GRID), np.arange(*DELAYS, _GRID)
+    # Both parts in one call, so that the number of covered samples is compared.
+    left = unexplained(np.concatenate([others, usual]))
+    found = int(left[: len(others)].argmin())
+    is_better = left[found] < min(_BETTER * left[len(others) :].min(), _UNEXPLAINED)
+    return float(others[found]) if is_better else 0.0
 
 
 def aligned(one: SensorRecording, path: TruePath, usable: BoolArray) -> float:

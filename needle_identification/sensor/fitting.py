@@ -66,7 +66,7 @@ class _Fitter:
         true = path.at(time - delay)
         self._center = true.mean(axis=0)
         _, sizes, directions = np.linalg.svd(true - self._center, full_matrices=False)
-        moved = directions[sizes > max(_MOVED * sizes[0], 0.0)]
+        moved = directions[sizes > _MOVED * sizes[0]]
         #: All axes, if all of them move.
         self.directions = np.eye(tip.shape[1]) if len(moved) == tip.shape[1] else moved
 

@@ -524,8 +524,9 @@ def test_different_clocks_are_named_and_corrected(offset: float, words: str) -> 
     assert not found['delay'].determined
     assert same['delay'].determined
     assert not same.warnings
-    # Other samples are covered at the ends: 0.4 um is a tenth of the error of the bias.
-    assert found['bias_x'].value == pytest.approx(same['bias_x'].value, abs=2e-6)
+    # The last 2 s of 75 s are not covered by both: much less than the error of the bias.
+    half = 0.5 * same['bias_x'].error
+    assert found['bias_x'].value == pytest.approx(same['bias_x'].value, abs=half)
     assert found['noise'].value == pytest.approx(same['noise'].value, rel=0.02)
     assert not found['slow_noise'].determined
 
@@ -537,8 +538,8 @@ def test_clocks_that_drift_apart_are_named() -> None:
     (words,) = (line for line in found.warnings if 'the clock of the tip sensor gains' in line)
     match = re.search(r'gains ([\d.]+) ms', words)
     assert match
-    # A standard error of 1 ms.
-    assert float(match[1]) == pytest.approx(75.0, abs=5.0)
+    # Four standard errors of 1 ms.
+    assert float(match[1]) == pytest.approx(75.0, abs=4.0)
     assert not found['delay'].determined
     assert not found['slow_noise'].determined
 
@@ -561,8 +562,8 @@ def test_error_that_follows_the_true_position_is_named(
     assert f'motion along z is measured {scale:.2f}' in words
     match = re.search(r'along x is .*? turned by ([\d.e-]+) deg', words)
     assert match
-    # 0.2 mm of noise, 10 mm of motion and 3000 samples: 0.03 deg.
-    assert float(match[1]) == pytest.approx(angle, abs=0.2)
+    # 0.2 mm of noise, 10 mm of motion and 3000 samples: four standard errors of 0.03 deg.
+    assert float(match[1]) == pytest.approx(angle, abs=0.12)
     assert not found['slow_noise'].determined
     assert found['noise'].value == pytest.approx(clean['noise'].value, rel=0.03)
     for axis in axes:

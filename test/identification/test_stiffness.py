@@ -664,7 +664,10 @@ def test_force_rotated_by_a_right_angle_is_not_a_spring(angle: float) -> None:
     found = identify_stiffness(replace(recording, force=recording.force @ rotation(angle).T))
     (level,) = found.levels
     assert level.words.startswith('not a spring unless the axes')
-    assert level['axes_rotation'].value == pytest.approx(-np.deg2rad(angle), abs=1e-2)
+    turned = level['axes_rotation']
+    assert turned.value == pytest.approx(-np.deg2rad(angle), abs=4.0 * turned.error)
+    # The noise of the force is below a thousandth of it.
+    assert turned.error < 1e-3
     assert 'curl zero' not in level.words
     assert np.isfinite(level.spring.interval).all()
     words = '-z,x' if angle > 0.0 else 'z,-x'
