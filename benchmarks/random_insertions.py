@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 import sys
 from tempfile import TemporaryDirectory
@@ -56,16 +57,26 @@ def at_target(plant: Any, target: Sequence[float]) -> tuple[str, str]:
     return end, f'{1e3 * off:.2f} mm from the target'
 
 
+@contextmanager
+def _quiet_nodes() -> Iterator[None]:
+    """Only outcomes are printed; a log level applies to all nodes with a name in the process."""
+    names = ('plant', 'controller', 'steering')
+    try:
+        for name in names:
+            set_logger_level(name, LoggingSeverity.FATAL)
+        yield
+    finally:
+        for name in names:
+            set_logger_level(name, LoggingSeverity.UNSET)
+
+
 def repeat(
     insert: Insertion, good: Sequence[str], bad: Sequence[str], head: str, count: int, seed: int
 ) -> int:
     """Repeat an insertion, print a table of good and bad ends, and return the exit status."""
-    # Only outcomes are printed; the log level applies to all nodes with this name in the process.
-    for name in ('plant', 'controller', 'steering'):
-        set_logger_level(name, LoggingSeverity.FATAL)
     rng, begun = np.random.default_rng(seed), monotonic()
     rows: dict[str, Counter[str]] = {}
-    with TemporaryDirectory() as folder:
+    with _quiet_nodes(), TemporaryDirectory() as folder:
         for number in trange(count, unit=' insertions', disable=None):
             row, end, line = insert(number, rng, Path(folder) / str(number))
             rows.setdefault(row, Counter())[end] += 1

@@ -6,6 +6,8 @@ from __future__ import annotations
 from benchmarks.random_insertions import repeat
 from benchmarks.restarts import names_action
 import pytest
+from rclpy.impl.logging_severity import LoggingSeverity
+from rclpy.logging import get_logger
 
 
 @pytest.mark.parametrize(
@@ -43,3 +45,5 @@ def test_status_is_that_of_the_worst_end(end: str, capsys: pytest.CaptureFixture
     assert '1: number 1\n' in said
     assert status == (end == 'hangs')
     assert said.splitlines()[-1].startswith('missed' if status else 'met')
+    # The level is that of the process, also of later tests.
+    assert get_logger('plant').is_enabled_for(LoggingSeverity.ERROR)
