@@ -8,7 +8,7 @@ sample, so that a late measurement is processed at its time.
 
 from __future__ import annotations
 
-from math import exp, pi, sqrt
+from math import exp, inf, pi, sqrt
 from typing import Annotated, Final, NamedTuple, TYPE_CHECKING
 
 from needle_controller.compiled.bending import (
@@ -125,7 +125,8 @@ def begin(boxed: Boxed[Filter], slot: int, time: float, span: float, depth: floa
         share += tip * tip / frozen.modes.squares[k]
     variance = f.noise.prior / share
     sample = f.samples[slot]
-    sample['time'], sample['depth'], sample['growth'] = time, depth, frozen.growth
+    sample['time'], sample['span'] = time, span
+    sample['depth'], sample['growth'] = depth, frozen.growth
     sample['nis'] = sample['degrees'] = 0.0
     f.states[slot] = 0.0
     covariance = f.covariances[slot]
@@ -329,9 +330,9 @@ def observe(
     velocity: float,
     lateral: float,
     moment: float,
-) -> None:
+) -> float:
     """
-    Process one sample into the slot ``new``, after the slot ``old``.
+    Process one sample into the slot ``new``, after the slot ``old``; return the load [N].
 
     ``count`` is the number of valid exposures. Over the sample the insertion depth changes from
     ``before`` to ``depth`` [m], with velocities ``rate`` and ``velocity`` [m/s]. ``lateral`` [N]
@@ -339,7 +340,7 @@ def observe(
     """
     # Mean of the cubic through both ends, limited to their range.
     mean = before + 0.5 * (depth - before) + span * (rate - velocity) / 12.0
-    depth = min(max(mean, min(before, depth)), max(before, depth))
+    end, depth = depth, min(max(mean, min(before, depth)), max(before, depth))
     velocity = 0.5 * (rate + velocity)
     f = boxed.value
     n = f.squares.shape[1]
@@ -361,12 +362,62 @@ def observe(
             f.tips[new, k] += frozen.at.value[i] * frozen.modes.shapes[i, k]
     _write_transition(f, frozen, change, span, velocity, f.transitions[new])
     _advance(f, count, old, new)
+    further, now = np.empty((2 * n, 2 * n)), np.empty(2 * n)
+    return _load(f.needle, _present(f, new, end, further, now), now, span)
+
+
+@kernel
+def expose(
+    boxed: Boxed[Filter],
+    count: int,
+    oldest: int,
+    newest: int,
+    start: float,
+    end: float,
+    slack: float,
+    deflection: float,
+) -> int:
+    """
+    Insert the exposure of a tip sample, ``start`` to ``end`` [s], and repeat the later steps.
+
+    It may overlap with its neighbors, or the time before the history, by ``slack`` [s], which is
+    cut off. Returns the new number of exposures, or -1 if the sample is refused.
+    """
+    f = boxed.value
+    exposures, first = f.exposures, f.samples[oldest]['time']
+    place = count
+    while place > 0 and exposures[place - 1, 1] > end:
+        place -= 1
+    floor = max(first, exposures[place - 1, 1]) if place > 0 else first
+    ceiling = exposures[place, 0] if place < count else inf
+    if start < floor - slack or end > ceiling + slack:
+        return -1
+    if count == exposures.shape[0]:
+        gone = 0
+        while gone < count and exposures[gone, 1] <= first:
+            gone += 1
+        if gone == 0:
+            return -1
+        for k in range(gone, count):
+            exposures[k - gone] = exposures[k]
+        count, place = count - gone, max(place - gone, 0)
+    for k in range(count, place, -1):
+        exposures[k] = exposures[k - 1]
+    start = max(start, floor)
+    exposures[place, 0], exposures[place, 1] = start, min(end, ceiling)
+    exposures[place, 2] = deflection
+    _repeat(f, count + 1, oldest, newest, start)
+    return count + 1
 
 
 @kernel
 def replay(boxed: Boxed[Filter], count: int, oldest: int, newest: int, since: float) -> None:
     """Recompute the slots later than ``since`` [s], the time of changed measurements."""
-    f = boxed.value
+    _repeat(boxed.value, count, oldest, newest, since)
+
+
+@inlined
+def _repeat(f: Filter, count: int, oldest: int, newest: int, since: float) -> None:
     slots, slot = f.samples.shape[0], newest
     while slot != oldest and f.samples[slot]['time'] > since:
         slot = slot - 1 if slot > 0 else slots - 1
@@ -377,13 +428,12 @@ def replay(boxed: Boxed[Filter], count: int, oldest: int, newest: int, since: fl
 
 
 @inlined
-def _present(
-    f: Filter, slot: int, depth: float, span: float, change: FloatArray, now: FloatArray
-) -> Frozen:
+def _present(f: Filter, slot: int, depth: float, change: FloatArray, now: FloatArray) -> Frozen:
     """Write c and b of the modes at the present depth, and their derivatives by the slot."""
     n = f.squares.shape[1]
-    frozen = freeze(f.needle, depth, f.samples[slot]['growth'], empty_normal_modes(n))
-    change_basis(_modes(f, slot), frozen.modes, -0.5 * span, 0.0, change)
+    sample = f.samples[slot]
+    frozen = freeze(f.needle, depth, sample['growth'], empty_normal_modes(n))
+    change_basis(_modes(f, slot), frozen.modes, -0.5 * sample['span'], 0.0, change)
     for i in range(2 * n):
         now[i] = 0.0
         for k in range(2 * n):
@@ -413,18 +463,9 @@ def _load(needle: CompiledNeedle, frozen: Frozen, now: FloatArray, span: float) 
     return coupling(density, needle.bending_stiffness, stiffness, bend, tip, rate)
 
 
-@compiled
-def present_load(boxed: Boxed[Filter], slot: int, depth: float, span: float) -> float:
-    """Return the force of the bent needle against insertion [N] as `estimate`."""
-    f = boxed.value
-    modal = 2 * f.squares.shape[1]
-    change, now = np.empty((modal, modal)), np.empty(modal)
-    return _load(f.needle, _present(f, slot, depth, span, change, now), now, span)
-
-
 @kernel
 def estimate(
-    boxed: Boxed[Filter], slot: int, depth: float, span: float, modal: Vector, jacobian: Matrix
+    boxed: Boxed[Filter], slot: int, depth: float, modal: Vector, jacobian: Matrix
 ) -> tuple[float, float, float]:
     """
     Transform the newest slot to modal coordinates at the present depth, half a sample later.
@@ -437,7 +478,7 @@ def estimate(
     needle, covariance = f.needle, f.covariances[slot]
     n = f.squares.shape[1]
     change, now = np.empty((2 * n, 2 * n)), np.empty(2 * n)
-    frozen = _present(f, slot, depth, span, change, now)
+    frozen = _present(f, slot, depth, change, now)
     at, modes = frozen.at, frozen.modes
     modal[:] = 0.0
     jacobian[:] = 0.0
@@ -458,5 +499,5 @@ def estimate(
     for i in range(2 * n):
         for k in range(2 * n):
             variance += row[i] * covariance[i, k] * row[k]
-    load = _load(needle, frozen, now, span)
+    load = _load(needle, frozen, now, f.samples[slot]['span'])
     return deflection, sqrt(max(variance, 0.0)), load

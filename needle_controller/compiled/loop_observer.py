@@ -11,7 +11,7 @@ from __future__ import annotations
 from math import nan
 from typing import NamedTuple, TYPE_CHECKING
 
-from needle_controller.compiled.filter import begin, Filter, observe, present_load
+from needle_controller.compiled.filter import begin, Filter, observe
 from needle_dynamics.arrays import Matrix
 from needle_dynamics.compiled.cache import compiled
 
@@ -59,13 +59,13 @@ def observed_load(
     depth = min(max(depth, needle.minimum_depth), needle.maximum_depth)
     done = int(row[_SAMPLES])
     new = 2 * lane + done % 2
-    nis = 0.0
+    nis = load = 0.0
     if done == 0:
         begin(boxed, new, time, period, depth)
     else:
         exposures = boxed.value.exposures
         exposures[0, 0], exposures[0, 1], exposures[0, 2] = time - o.exposure, time, tip
-        observe(
+        load = observe(
             boxed, 1, 4 * lane + 1 - new, new, time, period, row[_DEPTH], depth, row[_VELOCITY],
             velocity, nan, nan,
         )  # fmt: skip
@@ -74,7 +74,6 @@ def observed_load(
     row[HEAD + done % history] = nis
     done += 1
     row[_DEPTH], row[_VELOCITY], row[_SAMPLES] = depth, velocity, done
-    load = present_load(boxed, new, depth, period)
     if done % o.interval == 0:
         total = 0.0
         for k in range(history):

@@ -26,6 +26,7 @@ from typing import Final, NamedTuple
 from needle_controller.compiled.filter import (
     begin,
     estimate,
+    expose,
     Filter,
     LOADS,
     observe,
@@ -138,7 +139,9 @@ class Observer:
         from needle_dynamics.compiled.boxed import Boxed
 
         self._boxed = Boxed(self._filter)
-        self._estimate: _Estimate | None = None  #: Computed when it is needed.
+        #: Computed when needed; the load of the newest sample is known without it [N].
+        self._estimate: _Estimate | None = None
+        self._load: float | None = None
         #: Stamp of the first sample [ns]: times of the filter are relative to it.
         self._origin: int | None = None
         #: Newest and oldest slot of the filter, and number of exposures of the tip.
@@ -161,6 +164,7 @@ class Observer:
         self.restarts = 0  #: Number of automatic restarts.
         self.warning: str | None = None  #: Reason of the last restart.
         self._last: _Encoders | None = None
+        self._load = None
         self._waiting: list[tuple[int, float, float]] = []
 
     # Measurements.
@@ -209,6 +213,7 @@ class Observer:
         if self._last is None:
             self._slot = self._oldest = self._count = 0
             begin(self._boxed, 0, time, self.period, sample.depth)
+            self._load = None
         else:
             lateral, moment = wrench or (nan, nan)
             self._advance(self._last, sample, _finite(lateral), _finite(moment))
@@ -250,39 +255,24 @@ class Observer:
         last encoder sample, and earlier than previous tip samples.
         """
         end = self._seconds(stamp) - self.settings.tip_latency
-        if self._last is None or not abs(deflection) <= _LARGEST:
+        last, history = self._last, self.settings.history
+        if last is None or not abs(deflection) <= _LARGEST or end > last.time + history:
             self.refused += 1
             return
         exposure = self.settings.tip_exposure
         start, slack = end - exposure, _OVERLAP * exposure
-        oldest = float(self._filter.samples[self._oldest]['time'])
-        tips, count = self._filter.exposures, self._count
-        place = count
-        while place > 0 and tips[place - 1, 1] > end:
-            place -= 1
-        floor = max(oldest, float(tips[place - 1, 1])) if place > 0 else oldest
-        ceiling = float(tips[place, 0]) if place < count else inf
-        late, ahead = start < floor - slack, end > self._last.time + self.settings.history
-        if late or ahead or end > ceiling + slack:
+        slots = self._count, self._oldest, self._slot
+        count = expose(self._boxed, *slots, start, end, slack, float(deflection))
+        if count < 0:
             self.refused += 1
             return
-        start, end = max(start, floor), min(end, ceiling)
-        if count == len(tips):
-            gone = int(np.count_nonzero(tips[:count, 1] <= oldest))
-            if gone == 0:
-                self.refused += 1
-                return
-            tips[: count - gone] = tips[gone:count]
-            count, place = count - gone, max(place - gone, 0)
-        tips[place + 1 : count + 1] = tips[place:count].copy()
-        tips[place] = start, end, deflection
-        self._count = count + 1
-        if start < self._last.time:
-            self._replay(start)
+        self._count = count
+        if start < last.time:
+            self._estimate = self._load = None
 
     def _replay(self, since: float) -> None:
         replay(self._boxed, self._count, self._oldest, self._slot, since)
-        self._estimate = None
+        self._estimate = self._load = None
 
     def _restart(self, reason: str) -> None:
         self.warning = f'{reason}; the observer restarted'
@@ -312,7 +302,7 @@ class Observer:
         self._slot = (old + 1) % slots
         if self._slot == self._oldest:
             self._oldest = (self._oldest + 1) % slots
-        observe(self._boxed, self._count, old, self._slot, *sample)
+        self._load = observe(self._boxed, self._count, old, self._slot, *sample)
 
     # Estimates.
 
@@ -323,7 +313,7 @@ class Observer:
             size = 2 * self.model.modes.count
             modal, jacobian = np.zeros(size), np.zeros((size, size))
             depth = self._last.depth
-            found = estimate(self._boxed, self._slot, depth, self.period, modal, jacobian)
+            found = estimate(self._boxed, self._slot, depth, modal, jacobian)
             self._estimate = _Estimate(modal, jacobian, *found)
         return self._estimate
 
@@ -359,7 +349,7 @@ class Observer:
         Modes above half the sample rate are left out: the estimates of their rates are noise, and
         the load depends on the square of the rates.
         """
-        return self._estimated().load
+        return self._estimated().load if self._load is None else self._load
 
     @property
     def tip_force(self) -> tuple[float, float]:
