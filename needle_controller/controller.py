@@ -113,8 +113,12 @@ class Measurement(NamedTuple):
         return None if self.base is None else self.base.behind
 
     @classmethod
-    def from_reading(cls, reading: Reading) -> Measurement:
-        """Convert a joint state to a measurement; `rotation` and efforts may be missing."""
+    def from_reading(cls, reading: Reading, origin: int = 0) -> Measurement:
+        """
+        Convert a joint state to a measurement, with the stamp of the time zero [ns].
+
+        `rotation` and efforts may be missing.
+        """
         found = reading.joint(INSERTION)
         positions, velocities, _ = reading.values
         if found is None or min(len(positions), len(velocities)) < len(reading.names):
@@ -124,7 +128,7 @@ class Measurement(NamedTuple):
             )
         depth, velocity, force = found
         angle, angular_velocity, _ = reading.joint(ROTATION) or (0.0, 0.0, nan)
-        time = reading.stamp / NANOSECONDS
+        time = (reading.stamp - origin) / NANOSECONDS
         return cls(time, depth, velocity, angle, angular_velocity, force)
 
     def is_finite(self) -> bool:
@@ -134,6 +138,7 @@ class Measurement(NamedTuple):
 
 
 NO_SETPOINT: Final = Setpoint(nan)  #: Setpoint of a command without a reference.
+_REST: Final = Setpoint(0.0)
 
 
 class ControllerOutput(NamedTuple):
@@ -394,10 +399,10 @@ class Controller:
         older than `age_limits`, as for the torque. After a gap or a step back in time the motion
         restarts from the measured depth.
         """
-        notice = None
+        notice, guide = None, self.guide
         gap = self._displacement.gap(measured.time)
         if gap:
-            if self.guide.moves:
+            if guide.moves:
                 notice = f'measurements continued after {gap:.3f} s; the motion starts again'
             self.release()
         if measured.is_finite() and isfinite(load):
@@ -406,17 +411,17 @@ class Controller:
             fault = f'joint_states and load must be finite, got {measured}, {load:g} N'
         if fault is None:
             notice = self._returned(measured) or notice
-            moves = self.target is not None and not self.guide.paused
+            moves = guide.target is not None and not guide.paused
             answer = self.check(measured, moves) if self.check is not None else None
             if answer is not None:
                 return answer
-            if self.target is not None:
+            if guide.target is not None:
                 self._ages.append(age)
                 self._age = min(self._ages)
                 fault = self._too_old()
         if fault is not None:
             self.release()
-        if fault is not None or self.target is None:
+        if fault is not None or guide.target is None:
             return ControllerOutput(
                 force=0.0, setpoint=Setpoint(measured.depth), fault=fault, notice=notice
             )
@@ -428,8 +433,8 @@ class Controller:
             else:
                 # The robot holds the last force.
                 loop.stop(loop.last if isnan(measured.force) else measured.force)
-        now = self.guide.at(measured.time, base.depth, base.velocity)
-        ahead = self.guide.ahead(measured.time + self.delay * self.period)
+        now = guide.at(measured.time, base.depth, base.velocity)
+        ahead = guide.ahead(measured.time + self.delay * self.period)
         torque = self._torque(measured)
         if self.relaxed:
             loop.unwind()
@@ -444,7 +449,7 @@ class Controller:
         if self._age > self.age_limits['rotation']:
             self._rotation.stop()
             return 0.0
-        return self._rotation.command(measured.angle, measured.angular_velocity, Setpoint(0.0))
+        return self._rotation.command(measured.angle, measured.angular_velocity, _REST)
 
     def _too_old(self) -> str | None:
         """Return a line if the insertion is unstable at the age of the measurements."""

@@ -309,7 +309,7 @@ class ControllerNode(ModelNode):
     def _passing(
         self,
         take: Callable[[Reading, int], ForceCommand | None],
-        then: Callable[[], None] = lambda: None,
+        then: Callable[[], None] | None = None,
     ) -> Callable[[Reading], None]:
 
         def on_reading(reading: Reading) -> None:
@@ -317,7 +317,8 @@ class ControllerNode(ModelNode):
             now = self.now()
             if (answer := take(reading, now)) is not None:
                 self._act(answer, now)
-            then()
+            if then is not None:
+                then()
 
         return on_reading
 

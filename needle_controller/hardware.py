@@ -241,9 +241,11 @@ class Robot:
         """Return the axial force on the needle [N] for an effort of the joint, in its unit."""
         return effort / self._gain
 
-    def measurement(self, reading: Reading) -> Measurement:
+    def measurement(self, reading: Reading, origin: int = 0) -> Measurement:
         """
         Convert a joint state, with any joints in any order, to a measurement.
+
+        `origin` is the stamp of the time zero [ns].
 
         The force is NaN if it is not reported, or with position commands. A missing joint,
         position, or velocity for efforts is a `ParameterError`.
@@ -251,7 +253,7 @@ class Robot:
         settings = self.settings
         position, speed, effort = self._find(settings.joint, reading)
         depth, velocity = self.length(position), self.velocity(speed)
-        time = reading.stamp / NANOSECONDS
+        time = (reading.stamp - origin) / NANOSECONDS
         angle = angular_velocity = 0.0
         force = nan
         if settings.command == POSITION:

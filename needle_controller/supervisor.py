@@ -44,6 +44,7 @@ class Supervisor(StateMachine[ForceCommand]):
         super().__init__(steady, {})
         self.receive(targets=True)
         self.safety = Safety(SafetyLimits(), ControllerSettings(), NeedleParameters())
+        self._joints = self.safety.streams['joint_states']
         self.retract_depth = 0.0  #: Insertion depth of `retract` [m].
         self.fault, self._kind = '', FaultKind.WAITING
         self._timing = TimingMonitor()
@@ -85,7 +86,7 @@ class Supervisor(StateMachine[ForceCommand]):
             wrench_frame=own.wrench_frame or BASE,
             simulated=simulated,
         )
-        self.safety.stop = stop
+        self.safety.stop, self._joints = stop, self.safety.streams['joint_states']
 
     def cleanup(self) -> None:
         self.controller = self._active = None
@@ -97,10 +98,6 @@ class Supervisor(StateMachine[ForceCommand]):
             self.controller.change(parameters, law=law, gains=gains)
             self.bending.model = NeedleModel(parameters)
             self._following.change(parameters)
-
-    @property
-    def _joints(self) -> InputMonitor:
-        return self.safety.streams['joint_states']
 
     @property
     def waits(self) -> bool:
@@ -337,7 +334,7 @@ class Supervisor(StateMachine[ForceCommand]):
             convert = Measurement.from_reading if self._robot is None else self._robot.measurement
             # A float has too few digits for Unix time.
             self._origin = stamp if self._origin < 0 else self._origin
-            measured = convert(Reading(stamp - self._origin, *reading[1:]))
+            measured = convert(reading, self._origin)
         except ParameterError as error:
             self._depth, self._joints.refused = None, str(error)
             return self._release_for(str(error), stamp)

@@ -329,7 +329,9 @@ class WaitingRequests:
 
     def take(self, stamp: int, only: WaitingRequest | None = None) -> WaitingRequest | None:
         """Return and remove a request, or this one, that was sent before a stamp [ns], if any."""
-        for one in [one for one in self._waiting if only is None or one is only]:
+        for one in self._waiting:
+            if only is not None and one is not only:
+                continue
             if one.stamp - stamp > REQUEST_AGE * NANOSECONDS:
                 # The clock was set back after its arrival.
                 self._drop(one, 'the clock was set back', Verdict.REJECTED)

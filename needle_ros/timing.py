@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time stamps in integer nanoseconds, and event rates."""
 
+import sys
 from typing import Any, Final
 
 NANOSECONDS: Final = 1_000_000_000
@@ -41,18 +42,19 @@ class RateCounter:
     """Rate of events over the last full second, and fraction of marked events."""
 
     def __init__(self) -> None:
-        self._start: int | None = None
+        self._start = sys.maxsize
         self._count = self._marked = 0
         self._rate = self._share = 0.0
 
     def add(self, now: int, marked: bool = False) -> None:
         """Count an event at time `now` [ns]."""
-        self._roll(now)
+        if not 0 <= now - self._start < NANOSECONDS:
+            self._roll(now)
         self._count += 1
         self._marked += marked
 
     def _roll(self, now: int) -> None:
-        elapsed = now - self._start if self._start is not None else -1
+        elapsed = now - self._start
         if 0 <= elapsed < NANOSECONDS:
             return
         if elapsed > 0:

@@ -76,8 +76,12 @@ class Reading(NamedTuple):
         if name not in self.names:
             return None
         k = self.names.index(name)
-        position, velocity, effort = [one[k] if k < len(one) else nan for one in self.values]
-        return position, velocity, effort
+        positions, velocities, efforts = self.values
+        return (
+            positions[k] if k < len(positions) else nan,
+            velocities[k] if k < len(velocities) else nan,
+            efforts[k] if k < len(efforts) else nan,
+        )
 
 
 class _Cursor:
@@ -223,7 +227,7 @@ class Template:
             found[0] * NANOSECONDS + found[1],
             self.frame,
             self.names,
-            tuple([found[block] for block in form.blocks]),
+            tuple(map(found.__getitem__, form.blocks)),
         )
 
 

@@ -133,9 +133,9 @@ class InputMonitor:
             self.frozen = True
             since = self.timeout / NANOSECONDS
             return Refusal('frozen', f'{self.name} has not changed for {since:g} s')
-        for step, jump in zip(steps, self._jumps, strict=False):
-            if step > jump:
-                return Refusal('jump', f'{self.name} jumped by {step:.6g}, more than {jump:g}')
+        if any(map(gt, steps, self._jumps)):
+            step, jump = next(one for one in zip(steps, self._jumps, strict=False) if gt(*one))
+            return Refusal('jump', f'{self.name} jumped by {step:.6g}, more than {jump:g}')
         return None
 
     def silence(self, now: int) -> float:

@@ -105,10 +105,6 @@ class SafetyLimits(CheckedSettings):
     )  # fmt: skip
 
 
-def _measured(value: float) -> float:
-    return 0.0 if isnan(value) else value
-
-
 class Guard:
     """
     Compare measurements with the limits; two readings in a row beyond a limit violate it.
@@ -177,16 +173,17 @@ class Guard:
 
     def wrench(self, force: Sequence[float], torque: Sequence[float]) -> str | None:
         """Check force [N] and torque [N m] along x, y (needle) and z; NaN counts as zero."""
-        x, axial, z = map(_measured, force)
-        around_x, torsion, around_z = map(_measured, torque)
+        values = [0.0 if isnan(one) else one for one in (*force, *torque)]
+        x, axial, z, around_x, torsion, around_z = values
         lateral, moment = hypot(x, z), hypot(around_x, around_z)
         return self._hold('base_wrench', axial, lateral, moment, torsion)
 
     def tip(self, deflection: float, depth: float = nan, lateral: float = 0.0) -> str | None:
         """Check the position of the tip along z, y and x [m]; NaN if it is not measured."""
         low, high = self._depths
-        outside = max(_measured(low - depth), _measured(depth - high), 0.0)
-        across = hypot(deflection, _measured(lateral))
+        # Zero first: the maximum ignores NaN after it.
+        outside = max(0.0, low - depth, depth - high)
+        across = hypot(deflection, 0.0 if isnan(lateral) else lateral)
         return self._hold('tip_deflection', across, outside)
 
     def forget(self, topic: str) -> None:
