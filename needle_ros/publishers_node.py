@@ -71,11 +71,13 @@ class Publishers:
 
     def count(self, topic: Topic, matched: int = 0) -> int:
         """Return the number of live publishers of a topic, of which `matched` are matched."""
-        publishers = self._node.get_publishers_info_by_topic(topic.name)
-        # The graph may be updated later than the matches, which include dead publishers.
-        number = max(len(publishers), matched)
+        # `count_publishers` does not follow a remapping, but takes a fraction of the time of the
+        # list. The graph may be updated later than the matches, which include dead publishers.
+        name = self._node.resolve_topic_name(topic.name)
+        number = max(self._node.count_publishers(name), matched)
         if not self._over:
             return number
+        publishers = self._node.get_publishers_info_by_topic(topic.name)
         # A process with an expired lease but no publisher must not hide a duplicate publisher.
         processes = {_process(one) for one in publishers}
         others = sum(

@@ -42,7 +42,7 @@ class RateCounter:
     """Rate of events over the last full second, and fraction of marked events."""
 
     def __init__(self) -> None:
-        self._start = sys.maxsize
+        self._start = sys.maxsize  #: Begin of the counted second [ns]; no event before it.
         self._count = self._marked = 0
         self._rate = self._share = 0.0
 
