@@ -28,6 +28,7 @@ LAGGING: Final = 5.0  #: Tolerance of a moving joint, as a multiple of its toler
 
 #: Time after which a stop is sent again to a needle that still moves [s], and number of stops.
 _STOP_AGAIN, _STOPS = 0.5, 4
+_BRAKES: Final = 0.3  #: Time after a stop in which motion is braking, also after a dead time [s].
 _SPAN: Final = 0.05  #: Time over which the velocity of the needle is measured [s].
 STILL: Final = 1e-4  #: Largest displacement of a needle at rest [m].
 
@@ -192,14 +193,20 @@ class MotionControl:
 
     def _braked(self) -> FloatArray:
         """Return the positions at which needle and guide come to rest [m, rad]."""
-        end, limit = self.at.copy(), self._settings.guide_limit
+        end = self.at.copy()
         # A needle that rests, or whose positions are implausible, is not moved into the tissue,
         # nor one that is withdrawn: it brakes on its way.
         moving = min(max(self.velocity, -self._settings.speed), self._settings.speed)
         end[0] = min(end[0] + 0.5 * BRAKING * moving, max(self.origin[0], self.goal[0]))
         end[0] = max(end[0], min(self.origin[0], 0.0))
-        end[1:3] = np.clip(end[1:3], -limit, limit)
+        end[1:3] = np.clip(end[1:3], -self._settings.guide_limit, self._settings.guide_limit)
         return end
+
+    @property
+    def _in_range(self) -> bool:
+        """Whether the guide is in its range: a position elsewhere is wrong, such as one in mm."""
+        room = LAGGING * self._settings.guide_tolerance
+        return bool(np.abs(self.at[1:3]).max() <= self._settings.guide_limit + room)
 
     def discard_stop(self) -> None:
         """Do not send the last stop again: it would end the next motion."""
@@ -212,7 +219,7 @@ class MotionControl:
 
     def _brake(self, end: FloatArray, now: int) -> JointMotion:
         # Without points, the joints brake and hold where they are.
-        count = _HELD if now - self._measured < _OLD else 0
+        count = _HELD if now - self._measured < _OLD and self._in_range else 0
         held = np.tile(end, (count, 1))
         times = BRAKING * np.arange(1.0, count + 1.0)
         move = JointMotion(self._settings.joints, times, held, np.zeros_like(held))
@@ -227,6 +234,8 @@ class MotionControl:
         if self._halted is None:
             self._halted = stamp, depth
         since, before = self._halted
+        if stamp - since <= _BRAKES * NANOSECONDS:
+            self._halted = since, depth
         if self._halt is None or stamp - since < _STOP_AGAIN * NANOSECONDS:
             return None
         self._halted = stamp, depth

@@ -462,6 +462,42 @@ def test_stop_is_sent_again_to_a_needle_that_still_moves(continuous: bool) -> No
     assert_allclose(robot.at, before, atol=1e-9)
 
 
+@pytest.mark.requirement('S-142')
+@pytest.mark.parametrize('continuous', [False, True])
+def test_braking_needle_is_not_stopped_again(continuous: bool) -> None:
+    """It brakes within 0.2 s, and rests then."""
+    robot = Robot(replace(SETTINGS, continuous=continuous))
+    robot.tick(20)
+    robot.aim()
+    while robot.at[0] < 0.0301 or robot.tracked[-1][0] - robot.tracked[-2][0] < 5e-5:
+        robot.tick()
+    robot.loop.events.take()
+    before = robot.at[0]
+    robot.request('stop')
+    robot.tick(200)
+    # Faster than 5 mm/s: at least 0.5 mm in 0.2 s without braking, half of it with.
+    assert robot.at[0] - before > 1e-4
+    assert not [line for _, line in robot.loop.events.take() if 'still moves' in line]
+
+
+@pytest.mark.requirement('S-142')
+@pytest.mark.parametrize('continuous', [False, True])
+def test_stop_does_not_move_a_guide_whose_position_is_wrong(continuous: bool) -> None:
+    """The robot reports mm instead of m."""
+    robot = Robot(replace(SETTINGS, continuous=continuous))
+    robot.tick(20)
+    robot.aim()
+    while robot.at[0] < 0.0301:
+        robot.tick()
+    robot.says = lambda at: (at[0], *(1e3 * at[1:]))
+    while robot.loop.steers:
+        robot.tick()
+    assert 'guide_' in robot.loop.fault
+    stopped = robot.at[1:]
+    robot.tick(100)
+    assert_allclose(robot.at[1:], stopped, atol=1e-9)
+
+
 @pytest.mark.requirement('S-187')
 @pytest.mark.parametrize('continuous', [False, True])
 def test_needle_moved_deeper_after_the_insertion_stops_the_system(continuous: bool) -> None:
