@@ -19,6 +19,7 @@ from needle_identification.recordings.live import LiveRecording
 from needle_identification.recordings.reading import (
     read_friction_recording,
     read_indentation_recording,
+    scaled_axis,
 )
 from needle_identification.result import limited, model_parameters, NODES, write_result
 from needle_identification.stiffness.identify import (
@@ -146,8 +147,13 @@ class IdentificationNode(BaseNode):
             # The first identification imports these: not while samples arrive.
             import_module('scipy.interpolate')
             import_module('scipy.stats')
-        self._force_axis = signed_axis(self.text('force_axis'), 'force_axis')
-        self._joint = signed(self.text('motion_axis') or contract.INSERTION)
+        force, unit = scaled_axis(self.text('force_axis'), 'force')
+        sign, axis = signed_axis(force, 'force_axis')
+        #: Factor to SI with the sign, and name, of the axis of the force and of the joint.
+        self._force_axis = sign * unit, axis
+        motion, unit = scaled_axis(self.text('motion_axis') or contract.INSERTION, 'depth')
+        sign, joint = signed(motion)
+        self._joint = sign * unit, joint
         if len(axes := self.value('axes')) != 2:
             raise ParameterError(f'axes must be two, got {axes}')
         self._bags = [name for name in self.value('bags') if name]
@@ -253,6 +259,8 @@ class IdentificationNode(BaseNode):
             write = partial(write_result, friction=None, stiffness=stiffness)
         if output := self.text('output'):
             write(output)
+        for words in summary.warnings:
+            self.get_logger().warning(words)
         self._found = found
         self._publish(publisher, _summary_statuses(summary))
         self._words = f'{_sentence(found)} from {len(summary.estimates)} recordings'
@@ -282,16 +290,16 @@ class IdentificationNode(BaseNode):
     # Running topics.
 
     def _on_motion(self, reading: Reading) -> None:
-        sign, joint = self._joint
+        factor, joint = self._joint
         found = reading.joint(joint)
         if self._live is not None and found is not None:
             position, velocity, _ = found
-            self._live.take_motion(reading.stamp, sign * position, sign * velocity)
+            self._live.take_motion(reading.stamp, factor * position, factor * velocity)
 
     def _on_force(self, reading: Reading) -> None:
         if self._live is not None:
-            sign, axis = self._force_axis
-            self._live.take_force(reading.stamp, sign * reading.values[0][AXES.index(axis)])
+            factor, axis = self._force_axis
+            self._live.take_force(reading.stamp, factor * reading.values[0][AXES.index(axis)])
 
     def _identify_live(self) -> None:
         """Identify, and publish the result; at most a fifth of the time is spent here."""
@@ -299,6 +307,7 @@ class IdentificationNode(BaseNode):
         if self._live is None or not self._live.samples or begin < self._next:
             return
         try:
+            self._live.check_current()
             recording = self._live.recording()
             estimate = identify_friction(recording, self.settings('friction.', FrictionSettings))
         except NeedleError as error:

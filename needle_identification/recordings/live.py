@@ -17,7 +17,7 @@ import numpy as np
 
 #: Largest plausible force [N], and depth [m] or velocity [m/s].
 _LARGEST: Final = {BASE_WRENCH.name: 1e4, JOINT_STATES.name: 100.0}
-_SET_BACK: Final = NANOSECONDS  # backward step of a clock set back, not of a late message [ns]
+_JUMP: Final = NANOSECONDS  # step of a clock that was set, not of a late message [ns]
 _MARGIN: Final = NANOSECONDS  # time before a motion that is kept [ns]
 _WITH_RESTS: Final = 3  # largest duration with rests, as a multiple of the window
 _MOVES: Final = 0.05  # smallest speed of a motion, as a fraction of the usual largest speed
@@ -28,7 +28,7 @@ class LiveRecording:
     The newest samples of running topics, as a recording of their last motions.
 
     Invalid samples are counted in ``dropped``. A clock that is set back discards all earlier
-    samples.
+    samples; a single stamp in the future is discarded.
 
     Parameters
     ----------
@@ -73,8 +73,12 @@ class LiveRecording:
         self._added: dict[str, tuple[list[int], list[tuple[float, ...]]]] = {
             name: ([], []) for name in self._series
         }
-        self._newest = 0
+        #: Stamp of the newest sample of each topic [ns], and number of samples.
+        self._newest: dict[str, int] = {}
         self._counts = dict.fromkeys(self._series, 0)
+        self._checked = 0  #: Number of samples at the last check.
+        #: Sample with a stamp far ahead, until the next sample of its topic.
+        self._ahead: dict[str, tuple[int, tuple[float, ...]]] = {}
 
     @property
     def samples(self) -> int:
@@ -94,15 +98,50 @@ class LiveRecording:
         if not abs(values[0]) <= _LARGEST[name]:
             self.dropped['implausible' if isfinite(values[0]) else 'not finite'] += 1
             return
-        if stamp < self._newest - _SET_BACK:
+        newest, ahead = self._newest.get(name, stamp), self._ahead.pop(name, None)
+        if stamp < newest - _JUMP:
             self._restart()
             self.dropped['clock set back'] += 1
             return
-        self._newest = max(self._newest, stamp)
+        if ahead is not None and stamp < ahead[0] - _JUMP:
+            self.dropped['stamp in the future'] += 1
+        elif ahead is not None:
+            self._add(name, *ahead)
+        elif stamp > newest + _JUMP:
+            self._ahead[name] = stamp, values
+            return
+        self._add(name, stamp, values)
+
+    def _add(self, name: str, stamp: int, values: tuple[float, ...]) -> None:
+        self._newest[name] = max(self._newest.get(name, stamp), stamp)
         self._counts[name] += 1
         stamps, all_values = self._added[name]
         stamps.append(stamp)
         all_values.append(values)
+
+    def check_current(self) -> None:
+        """
+        Check that both topics have new samples; to call at most once a second.
+
+        Raises
+        ------
+        RecordingError
+            Without a new sample of both topics since the last call, or if the newest stamps of the
+            topics differ by more than a second.
+
+        """
+        if not self.samples:
+            return
+        before, self._checked = self._checked, self.samples
+        (one, first), (other, second) = sorted(self._newest.items(), key=lambda item: item[1])
+        if second - first > _JUMP:
+            apart = (second - first) / NANOSECONDS
+            raise RecordingError(
+                f'{one} is {apart:.3g} s older than {other}: it is not published any more, or the '
+                'clocks of the publishers differ'
+            )
+        if self.samples == before:
+            raise RecordingError(f'no new samples of {one} and {other}')
 
     def recording(self) -> Recording:
         """Return the kept samples; `RecordingError` if force and motion do not overlap in time."""
@@ -132,7 +171,8 @@ class LiveRecording:
         steps = np.diff(moving)[::-1]
         elapsed = np.cumsum(np.where(steps <= _MARGIN, steps, 0))
         count = min(int(np.searchsorted(elapsed, self._window)) + 1, len(moving))
-        begin = max(int(moving[-count]) - _MARGIN, self._newest - _WITH_RESTS * self._window)
+        oldest = max(self._newest.values()) - _WITH_RESTS * self._window
+        begin = max(int(moving[-count]) - _MARGIN, oldest)
         for series in self._series.values():
             series.keep(series.stamps >= begin)
 

@@ -124,13 +124,13 @@ def read_friction_recording(
         return friction_table.friction_recording(tables.read_table(Path(path)), columns or {})
     if columns:
         raise RecordingError(f'{path} is a bag: --columns is for tables ({", ".join(TABLES)})')
-    given, size = _without_unit(force_axis, 'force')
+    given, size = scaled_axis(force_axis, 'force')
     sign, axis = signed_axis(given, 'force axis')
     bag = Bag(path)
     topics = bag.topics()
     wrench = chosen_topic(bag, topics, _WRENCH, wrench_topic)
     motion = chosen_topic(bag, topics, _FRICTION_MOTION, motion_topic)
-    along_axis, length = _without_unit(motion_axis, 'depth')
+    along_axis, length = scaled_axis(motion_axis, 'depth')
     source, direction, name = _motion_source(bag, motion, along_axis)
     force_source = samples.source_of(wrench.type_name, [axis])
     gathered, configuration = read_samples(bag, {wrench: force_source, motion: source}, time)
@@ -221,8 +221,8 @@ def read_indentation_recording(
     )
 
 
-def _without_unit(axis: Any, role: str) -> tuple[Any, float]:
-    """Split an axis, such as ``slide[mm]`` or ``spindle*0.002``, into its name and its factor."""
+def scaled_axis(axis: Any, role: str) -> tuple[Any, float]:
+    """Split an axis, such as ``slide[mm]`` or ``spindle*0.002``, into name and factor (to SI)."""
     found = tables.SPEC.match(axis or '')
     name, factor, unit = found.groups() if found else (axis, None, None)
     known = unit is None or unit in UNITS[role]
@@ -250,7 +250,7 @@ def _plane(
     name: str, axes: tuple[str, str], role: str
 ) -> tuple[FloatArray, tuple[str, ...], FloatArray]:
     """Return the signs, names and sizes of the units of two different axes."""
-    given, sizes = zip(*(_without_unit(axis, role) for axis in axes), strict=True)
+    given, sizes = zip(*(scaled_axis(axis, role) for axis in axes), strict=True)
     signs, plane = zip(*(signed_axis(axis, f'each of {name}') for axis in given), strict=True)
     if len(set(plane)) != 2:
         raise ParameterError(f'{name} must be two different axes of x, y, z, got {axes!r}')

@@ -121,6 +121,45 @@ def test_positions_without_velocity_are_differentiated() -> None:
     check(fed(velocities=False), 0.02)
 
 
+@pytest.mark.parametrize('step', [2, 10, 10_000])
+@given(at=st.integers(10, len(SAMPLES) - 10), forces=st.booleans())
+@settings(max_examples=10, deadline=None)
+def test_single_stamp_in_the_future_is_discarded(step: int, at: int, forces: bool) -> None:
+    """Of either topic, by 2 s and more: the recording is that without it."""
+    live = fed(SAMPLES[:at])
+    stamp = SAMPLES[at][0] + step * 10**9
+    if forces:
+        live.take_force(stamp, 5.0)
+    else:
+        live.take_motion(stamp, 0.05, 0.1)
+    feed(live, SAMPLES[at:])
+    assert live.dropped == {'stamp in the future': 1}
+    expected = fed()
+    for name in ('time', 'depth', 'force'):
+        assert_array_equal(getattr(live.recording(), name), getattr(expected.recording(), name))
+
+
+def test_clock_that_is_set_forward_discards_nothing() -> None:
+    later = [(stamp + 10**13, depth, velocity, force) for stamp, depth, velocity, force in SAMPLES]
+    live = fed([*SAMPLES[:1000], *later[1000:]])
+    assert live.dropped == {}
+    assert live.samples == len(SAMPLES)
+
+
+@pytest.mark.parametrize('ended', [JOINT_STATES.name, BASE_WRENCH.name])
+def test_topics_without_new_samples_are_an_error(ended: str) -> None:
+    """Of both topics, or of one while the other is published."""
+    live = fed()
+    live.check_current()
+    with pytest.raises(RecordingError, match='no new samples of'):
+        live.check_current()
+    for k in range(1, 4):
+        stamp = SAMPLES[-1][0] + k * 500_000_000
+        (live.take_force if ended == JOINT_STATES.name else live.take_motion)(stamp, 0.0)
+    with pytest.raises(RecordingError, match=rf'{ended} is 1\.5 s older than'):
+        live.check_current()
+
+
 def test_samples_between_two_identifications_are_added() -> None:
     """The order of samples and recordings does not matter."""
     live = LiveRecording(1e3)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification node: results from bags and running topics, and parameters of other nodes."""
 
+from dataclasses import replace
 import math
 from pathlib import Path
 import subprocess
@@ -15,6 +16,7 @@ from needle_identification.identification_node import IdentificationNode
 from needle_ros.base_node import COMMAND, LATCHED, SENSOR
 from needle_ros.event_log import Severity
 from needle_ros.status import IdentificationStatus
+from numpy.testing import assert_allclose
 import pytest
 from rcl_interfaces.srv import GetParameters
 from rclpy.node import Node
@@ -147,6 +149,17 @@ def test_service_reports_the_reason_of_a_failure(ros_graph: RosGraph) -> None:
     assert node.is_active
 
 
+def test_recordings_that_differ_are_reported(
+    ros_graph: RosGraph, bags: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As by the command: another needle has twice the friction."""
+    other = simulated(sensor=NOISY, seed=3)
+    write_bag(tmp_path / 'other', replace(other, force=2.0 * other.force))
+    ros_graph.add(IdentificationNode, parameters={'bags': [*bags, str(tmp_path / 'other')]})
+    assert call(ros_graph, 'identify')[0]
+    assert 'the recordings differ' in capfd.readouterr().err
+
+
 def test_service_uses_the_current_bags(ros_graph: RosGraph, bags: list[str]) -> None:
     """A running node identifies from other recordings without a restart."""
     node = ros_graph.add(IdentificationNode, parameters={'bags': bags[:1]})
@@ -229,6 +242,31 @@ def test_friction_of_a_running_plant_is_identified(ros_graph: RosGraph) -> None:
     ros_graph.spin_until(
         lambda: any('mu_s = 0.' in s.message for r in reports for s in r.status), 'diagnostics'
     )
+
+
+def test_running_topics_have_the_units_of_the_axes(ros_graph: RosGraph) -> None:
+    """As recordings: mm against the axis, and mN."""
+    axes = {'motion_axis': '-slide[mm]', 'force_axis': 'z[mN]'}
+    node = ros_graph.add(IdentificationNode, parameters={'live': True, **axes})
+    probe = ros_graph.node('probe')
+    joints = probe.create_publisher(JointState, 'joint_states', SENSOR)
+    wrenches = probe.create_publisher(WrenchStamped, 'base_wrench', SENSOR)
+    ros_graph.spin_until(
+        lambda: joints.get_subscription_count() and wrenches.get_subscription_count(), 'discovery'
+    )
+    for k in range(3):
+        state = JointState(name=['slide'], position=[-50.0 - k], velocity=[-100.0])
+        wrench = WrenchStamped()
+        wrench.wrench.force.z = 700.0
+        for message in (state, wrench):
+            message.header.stamp.sec, message.header.stamp.nanosec = 5, 10_000_000 * k
+        joints.publish(state)
+        wrenches.publish(wrench)
+    ros_graph.spin_until(lambda: node.diagnose().status.samples == 3, 'the samples')
+    recording = node._live.recording()
+    assert_allclose(recording.depth, [0.050, 0.051, 0.052], rtol=1e-12)
+    assert_allclose(recording.velocity, 0.1, rtol=1e-12)
+    assert_allclose(recording.force, 0.7, rtol=1e-12)
 
 
 def test_invalid_messages_are_counted_and_the_node_stays_active(ros_graph: RosGraph) -> None:
