@@ -153,6 +153,9 @@ def _compared(
     unit, own = _unit_of('speed', 1.0 / ratio), _unit_of('depth', ratio)
     words = f'the speed is {ratio:.4g} ± {error:.2g} times the change of the positions'
     words += f' (speed in {unit}?)' if unit else f' (depth in {own}?)' if own else ''
+    if ratio < 0.0:
+        # The sign of the velocity is that of the friction, otherwise friction is negative.
+        return recording, signals, (f'{words}: depth or velocity has the wrong sign',)
     if own or not automatic:
         return recording, signals, (words,)
     alone = replace(recording, velocity=None)

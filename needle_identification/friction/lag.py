@@ -112,11 +112,15 @@ def velocity_delay(recording: Recording) -> float:
 
 
 def velocity_scale(recording: Recording) -> tuple[float, float] | None:
-    """Return the ratio of velocity and positions, and its error; None if it may be one."""
+    """
+    Return the ratio of velocity and positions, and its error; None if it may be one.
+
+    It is negative if one of them has the wrong sign.
+    """
     change, travel, depth = _changes(recording)
     # Noise of the velocity raises the second ratio, noise of the positions reduces the first.
     (low, error), (inverse, _) = _first((depth, change), travel), _first((travel, change), depth)
-    if not (low > 0.0 and inverse > 0.0):
+    if not low * inverse > 0.0:
         return None
     ratio, error = 0.5 * (low + 1.0 / inverse), hypot(error, 0.5 * (1.0 / inverse - low))
     return (ratio, error) if abs(ratio - 1.0) > max(SAME_SCALE, _CERTAIN * error) else None

@@ -267,6 +267,18 @@ def test_a_velocity_with_another_scale_than_the_positions_is_named(
     assert velocity_scale(plain) is None
 
 
+def test_positions_against_the_velocity_are_named() -> None:
+    """Friction has the sign of the velocity, and the terms of depth that of the positions."""
+    for seed in range(5):
+        recording, truth = recorded(NoiseKind(speed_noise=1e-5), np.random.default_rng(seed))
+        found = identify_friction(replace(recording, depth=-recording.depth))
+        (words,) = (words for words in found.warnings if 'times the change' in words)
+        assert words.startswith('the speed is -1')
+        assert words.endswith('depth or velocity has the wrong sign')
+        for name, value in truth.items():
+            assert abs(found[name].value - value) < 4.0 * found[name].error
+
+
 def holding(found: FrictionEstimate, truth: Mapping[str, float]) -> int:
     """Return the number of intervals that contain the true value."""
     intervals = [(found[name].interval, value) for name, value in truth.items()]
