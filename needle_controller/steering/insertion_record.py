@@ -68,6 +68,13 @@ class SteeringRecord:
             raise MessageError(f'not a record of an insertion: {error}') from error
 
     @property
+    def target(self) -> tuple[float, float, float]:
+        """Newest target of the tip, x, y, z [m]."""
+        aims = [entry['aim'] for entry in self.history if 'aim' in entry]
+        x, z = aims[-1] if aims else (self.point[0], self.point[2])
+        return x, self.depths[-1], z
+
+    @property
     def plans(self) -> list[Sequence[float]]:
         """Setpoints so far: guide at x, z [m], roll [rad]."""
         return [entry['plan'] for entry in self.history if 'plan' in entry]

@@ -48,8 +48,7 @@ class InsertionPlanner:
         record = self.recalled
         if record is None or not depth > record.depths[0] + _OUTSIDE:
             return ''
-        x, _, z = record.point
-        at = describe_target((x, record.depths[-1], z))
+        at = describe_target(record.target)
         if record.ended:
             return f'; the insertion to {at} has ended ({record.ended}): retract the needle'
         return (
@@ -68,7 +67,7 @@ class InsertionPlanner:
         record, depth = self.recalled, float(request.at[0])
         if begun is None and record is not None:
             begun = float(record.depths[0])
-            same = abs(request.point[1] - record.depths[-1]) <= _SAME
+            same = abs(request.point[1] - record.target[1]) <= _SAME
             if same and depth > begun + _OUTSIDE:
                 try:
                     record.check(request.at, tip, state, self.settings)

@@ -151,6 +151,25 @@ def test_target_may_change_with_the_restart() -> None:
     assert rig.loop.law.target.tolist() == [x, z]
 
 
+@pytest.mark.parametrize('restarts', [1, 2])
+def test_newest_target_is_the_one_to_send_again(restarts: int) -> None:
+    """The state names it, and the insertion is resumed to it without another change."""
+    rig = Rig()
+    rig.begin(900)
+    newest = x, _, z = -TARGET[0], TARGET[1], -TARGET[2]
+    assert rig.aim(newest) == ''
+    for _ in range(restarts):
+        rig.restart()
+        rig.tick(200)
+        assert f'to x = {1e3 * x:.2f} mm, z = {1e3 * z:.2f} mm at a depth of' in rig.said
+        assert rig.aim(newest) == ''
+    assert rig.loop.law.target.tolist() == [x, z]
+    rig.keep()
+    record = SteeringRecord.from_values(json.loads(rig.text))
+    assert [entry['aim'] for entry in record.history if 'aim' in entry] == [[x, z]]
+    assert record.target == newest
+
+
 MOVED = 'outside its last motion'
 
 
