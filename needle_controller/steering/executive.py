@@ -51,6 +51,9 @@ _JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
 #: that settles at the limit does not end the insertion.
 _LEFT: Final = 1.5
 
+#: Begin of the reason why a stopped node rejects a request.
+_STOPPED: Final = 'stopped: '
+
 _MOVING: Final = (Phase.GUIDING, Phase.INSERTING, Phase.RETRACTING)
 
 
@@ -185,7 +188,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
     def _check_mode(self) -> None:
         """Raise `JobError` if the system does not permit an insertion now."""
         if self.authority.reason:
-            raise JobError(f'stopped: {self.authority.reason}; ~/clear_stop releases')
+            raise JobError(f'{_STOPPED}{self.authority.reason}; ~/clear_stop releases')
         if self.phase is Phase.RETRACTING:
             raise JobError('the needle is withdrawn; wait until it rests, or stop it')
         if self._obeyed is Mode.PAUSED and not self.steers:
@@ -262,6 +265,8 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if mode in (Mode.STOPPED, Mode.RETRACTING) or before is Mode.STOPPED:
             self.requests.supersede(now)
         if mode is Mode.STOPPED:
+            if not (self.steers or self._moves):
+                self.events.add(Severity.ERROR, f'{_STOPPED}{self.authority.reason}')
             return self.halt(self.authority.reason, now)
         self._motions.discard_stop()
         if mode is Mode.RETRACTING:
@@ -294,7 +299,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
     def halt(self, why: str, now: int) -> JointMotion | None:
         """End the insertion or retraction for a reason: brake to rest, and cancel a plan."""
         self.requests.supersede(now)
-        self._cancel(Verdict.REJECTED, f'stopped: {why}')
+        self._cancel(Verdict.REJECTED, f'{_STOPPED}{why}')
         moves = self._moves
         if not (self.steers or moves):
             return None
@@ -302,7 +307,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if self._obeyed is Mode.RETRACTING:
             self._retraction = Retraction(self._motions, self.settings, self.events)
         self._motions.monitor.forget()
-        self.events.add(Severity.ERROR, f'stopped: {why}')
+        self.events.add(Severity.ERROR, f'{_STOPPED}{why}')
         return self._motions.stop(now) if moves else None
 
     def receive(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
@@ -444,5 +449,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
             requests=self.requests.status(),
         )
         failure = '' if self._retraction is None else self._retraction.failure
+        if self.authority.reason:
+            failure = f'{_STOPPED}{self.authority.reason}'
         advice = '' if insertion else self.planner.advice(float(self._motions.at[0]))
         return (*summarize(status, insertion, failure, advice), status)

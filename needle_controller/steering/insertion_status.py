@@ -67,18 +67,22 @@ def describe(
 def summarize(
     status: SteeringStatus, insertion: SteppedInsertion | None, failure: str, advice: str
 ) -> tuple[Severity, str]:
-    """Return severity and state in one line, with the failure or the advice, if not empty."""
+    """
+    Return severity and state in one line.
+
+    It has the failure, such as a stop while nothing moves, or the advice, if not empty.
+    """
     if status.phase is Phase.STOPPED:
         return Severity.ERROR, f'stopped: {status.fault}'
-    if failure and status.phase is Phase.IDLE:
+    if failure and status.phase in (Phase.IDLE, Phase.DONE):
         return Severity.ERROR, failure
     if status.warning:
         return Severity.WARNING, status.warning
+    paused = '; paused' if status.system is Mode.PAUSED else ''
     if insertion is not None and status.phase is Phase.DONE:
         line, severity = insertion.law.outcome()
-        return severity, f'done: {line}'
+        return severity, f'done: {line}{paused}'
     words = _DESCRIPTIONS[status.phase]
     if status.planned_fraction is not None:
         return Severity.INFO, f'{words}: {status.planned_fraction:.0%}'
-    paused = '; paused' if status.system is Mode.PAUSED else ''
     return Severity.INFO, f'{words}{paused}{advice if status.phase is Phase.IDLE else ""}'

@@ -485,6 +485,42 @@ def test_stop_of_a_retraction_ends_it() -> None:
     assert robot.at[0] == pytest.approx(SETTINGS.retract_depth, abs=SETTINGS.depth_tolerance)
 
 
+@pytest.fixture(scope='module')
+def resting() -> dict[str, Robot]:
+    """Return robots that rest: before an insertion, after one, and after a retraction."""
+    idle, done, retracted = Robot(), Robot(), inserted(False, 0.02)
+    idle.tick(20)
+    done.steer()
+    assert retracted.request(RETRACT)
+    retracted.tick(1500)
+    return {'idle': idle, 'done': done, 'retracted': retracted}
+
+
+@pytest.mark.requirement('S-345')
+@pytest.mark.parametrize('before', ['idle', 'done', 'retracted'])
+def test_state_names_a_stop_and_a_pause_while_nothing_moves(
+    resting: dict[str, Robot], before: str
+) -> None:
+    """One line in the log; nothing moves, and the state is as before after the release."""
+    robot = resting[before]
+    state, at = robot.loop.diagnose(robot.now)[:2], robot.at.copy()
+    assert state[0] < Severity.ERROR
+    assert 'stopped' not in state[1]
+    robot.loop.events.take()
+    assert robot.request(STOP)
+    robot.tick(100)
+    assert robot.loop.diagnose(robot.now)[:2] == (Severity.ERROR, 'stopped: requested by a user')
+    assert robot.loop.events.take() == [(Severity.ERROR, 'stopped: requested by a user')]
+    assert robot.aim().startswith('target rejected: stopped: requested by a user')
+    assert robot.request(CLEAR_STOP)
+    assert robot.loop.diagnose(robot.now)[:2] == state
+    assert robot.request(PAUSE)
+    assert robot.loop.diagnose(robot.now)[:2] == (state[0], f'{state[1]}; paused')
+    assert robot.request(RESUME)
+    assert robot.loop.diagnose(robot.now)[:2] == state
+    assert_allclose(robot.at, at, atol=1e-12)
+
+
 @pytest.mark.requirement('S-008')
 def test_pause_during_planning_holds_the_start() -> None:
     """A target is refused during a pause."""
