@@ -319,7 +319,8 @@ class SteeringExecutive(StateMachine[JointMotion]):
             return self._stop(str(refusal), now)
         if self._retraction is not None:
             self._retraction.refuse(refusal)
-        elif self.phase is Phase.STOPPED:
+        elif self.phase is Phase.STOPPED and not refusal.reason.startswith(_STOPPED):
+            # A node that is stopped itself rejects the motion to rest, too.
             self.events.add(Severity.ERROR, f'the stop failed: {refusal}')
         return None
 

@@ -459,6 +459,31 @@ def test_insertion_after_a_retraction_hits_its_target() -> None:
     assert robot.miss < 6e-4
 
 
+@pytest.mark.requirement('S-006')
+@STRATEGIES
+@pytest.mark.parametrize(
+    ('why', 'fails'),
+    [
+        ('stopped: requested by a user; ~/clear_stop releases', False),
+        ('stopped: a limit', False),
+        ('the controller is not active', True),
+    ],
+)
+def test_rejected_stop_fails_unless_the_node_is_stopped_itself(
+    continuous: bool, why: str, fails: bool
+) -> None:
+    """Each node of a stopped system rejects the motion to rest."""
+    robot = inserted(continuous, 0.02)
+    robot.loop.events.take()
+    robot.rejects = lambda name, _move: why if name == 'controller' else ''
+    assert robot.request(STOP)
+    robot.ways[0] = np.zeros(1), robot.at[:1]
+    robot.tick(100)
+    said = [line for severity, line in robot.loop.events.take() if severity is Severity.ERROR]
+    failed = [f'the stop failed: controller rejected the motion: {why}']
+    assert said == ['stopped: requested by a user', *(failed if fails else [])]
+
+
 @pytest.mark.requirement('S-011', 'S-288')
 def test_stop_of_a_retraction_ends_it() -> None:
     robot = inserted(False, 0.04)
