@@ -5,12 +5,17 @@ from collections import Counter
 from collections.abc import Callable
 from enum import IntEnum
 from math import inf
+import re
 from time import monotonic
 from typing import Final
 
 from needle_ros.errors import printable
 
 _PAUSE: Final = 1.0  #: Minimum time between two lines of the same kind [s].
+_MOST_KINDS: Final = 100  #: Number of kinds after which a new reason is not its own kind.
+
+#: A number in a line; digits in a name are none.
+_NUMBER: Final = re.compile(r'(?<!\w)-?\d[\d.]*(?:e[-+]?\d+)?')
 
 
 class Severity(IntEnum):
@@ -52,11 +57,18 @@ class EventLog:
         self.changed = True
 
     def reject(self, reason: str) -> None:
-        """Count a rejected input, and add an error line with its name and the reason."""
+        """
+        Count a rejected input, and add an error line with its name and the reason.
+
+        Reasons are of one kind if they differ in numbers only; after many, by their name.
+        """
         self.rejected += 1
         self.last_rejection = printable(reason)
-        # The first word is the topic or service.
-        self.add(Severity.ERROR, reason, f'refused {reason.partition(" ")[0]}')
+        kind = f'refused {_NUMBER.sub("0", self.last_rejection)}'
+        if kind not in self._times and len(self._times) >= _MOST_KINDS:
+            # The first word is the topic or service.
+            kind = f'refused {reason.partition(" ")[0]}'
+        self.add(Severity.ERROR, reason, kind)
 
     def take(self) -> list[tuple[Severity, str]]:
         """Return and clear the collected lines."""

@@ -200,7 +200,8 @@ class SteeringExecutive(StateMachine[JointMotion]):
                 raise JobError(f'{stream.publishers} nodes publish {stream.name}')
             timeout = self.settings.measurement_timeout
             if stream.counted is None or stream.silence(now) > timeout:
-                raise JobError(f'no {stream.name} received within {timeout:g} s')
+                valid, why = ('valid ', f'; {stream.refused}') if stream.refused else ('', '')
+                raise JobError(f'no {valid}{stream.name} received within {timeout:g} s{why}')
         if not self._motions.known:
             raise JobError('no positions of needle and guide received')
         return self._motions.at

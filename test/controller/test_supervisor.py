@@ -585,6 +585,27 @@ def test_log_lines_of_a_kind_are_limited_to_one_per_second() -> None:
     assert events.take() == []
 
 
+@pytest.mark.requirement('S-003')
+def test_rejections_are_merged_if_only_their_numbers_differ() -> None:
+    """Of one second; each other reason has its line, also of the same topic."""
+    now = 0.0
+    events = EventLog(steady=lambda: now)
+    depth = 'target rejected: the needle is at {} mm already'
+    others = ['target rejected: paused', 'target rejected: stopped: a limit']
+    frames = [f'target must be in frame {name!r}' for name in ('', 'tip', 'tool0', 'tool1')]
+    for reason in [depth.format('-0.50'), *others, *frames, depth.format('1e-05'), *others]:
+        events.reject(reason)
+    assert [line for _, line in events.take()] == [depth.format('-0.50'), *others, *frames]
+    assert events.rejected == 10
+    now = 1.0
+    events.reject(depth.format(3))
+    assert [line for _, line in events.take()] == [f'{depth.format(3)} (1 similar omitted)']
+    # Any number of reasons is bounded: afterwards those of a topic are merged.
+    for number in range(2000):
+        events.reject(f'target must be in frame {"a" * (number % 400)}{number:x}z')
+    assert len(events.take()) <= 100
+
+
 def test_many_rejected_targets_give_one_log_line_per_second() -> None:
     """All are counted; /diagnostics changes as often as the log."""
     loop = Loop()

@@ -617,6 +617,29 @@ def test_invalid_targets_are_rejected(
     assert robot.aim() == ''
 
 
+@pytest.mark.parametrize('before', [0, 5], ids=['never valid', 'valid before'])
+@pytest.mark.parametrize('name', ['joint_states', 'tip_deflection'])
+def test_rejection_of_a_target_has_the_reason_of_refused_measurements(
+    name: str, before: int
+) -> None:
+    """They arrive, but are not valid; the reason is gone with the next valid one."""
+    robot = Robot()
+    robot.tick(before)
+    nan = [np.nan] * 3
+    if name == 'joint_states':
+        robot.says = lambda _: nan
+    else:
+        robot.sees = lambda _: nan
+    robot.tick(60)
+    assert robot.aim() == (
+        f'target rejected: no valid {name} received within 0.5 s; {name} must be finite, '
+        'got [nan, nan, nan]'
+    )
+    robot.says = robot.sees = lambda values: values
+    robot.tick(5)
+    assert robot.aim() == ''
+
+
 def test_too_many_steps_are_rejected() -> None:
     """Their plan would exceed the memory."""
     robot = Robot(replace(SETTINGS, step_length=1e-4, depth_tolerance=1e-5))
