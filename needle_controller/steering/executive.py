@@ -453,5 +453,6 @@ class SteeringExecutive(StateMachine[JointMotion]):
         failure = '' if self._retraction is None else self._retraction.failure
         if self.authority.reason:
             failure = f'{_STOPPED}{self.authority.reason}'
-        advice = '' if insertion else self.planner.advice(float(self._motions.at[0]))
+        depth, state = float(self._motions.at[0]), self.authority.state.newest
+        advice = '' if insertion else self.planner.advice(depth, state)
         return (*summarize(status, insertion, failure, advice), status)

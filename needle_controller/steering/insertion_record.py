@@ -79,16 +79,20 @@ class SteeringRecord:
         """Setpoints so far: guide at x, z [m], roll [rad]."""
         return [entry['plan'] for entry in self.history if 'plan' in entry]
 
+    def over(self, state: int) -> str:
+        """Return why it cannot be continued at a time of the newest system state [ns], or ''."""
+        if self.ended or state <= self.state:
+            return self.ended
+        return 'the system was stopped, paused or retracted'
+
     def check(
         self, at: FloatArray, tip: Sequence[float] | None, state: int, own: ExecutiveSettings
     ) -> None:
         """Raise `JobError` if joints [m, rad], tip x, y, z [m] or state [ns] have changed."""
-        if self.ended:
-            raise JobError(self.ended)
+        if why := self.over(state):
+            raise JobError(why)
         if self.continuous or own.continuous:
             raise JobError('the needle is inserted without rests')
-        if state > self.state:
-            raise JobError('the system was stopped, paused or retracted')
         before, goal = self._motion
         low = np.minimum(before, goal)[: len(at)] - LAGGING * own.tolerances
         high = np.maximum(before, goal)[: len(at)] + LAGGING * own.tolerances

@@ -43,14 +43,19 @@ class InsertionPlanner:
     request: PlannedInsertion | None = None  #: its request
     recalled: SteeringRecord | None = None  #: record of the insertion before a restart
 
-    def advice(self, depth: float) -> str:
-        """Return advice to the user after a restart with a needle at a depth [m], or ''."""
+    def advice(self, depth: float, state: int) -> str:
+        """
+        Return advice to the user after a restart with a needle at a depth [m], or ''.
+
+        ``state`` is the time of the newest change of the system state [ns].
+        """
         record = self.recalled
         if record is None or not depth > record.depths[0] + _OUTSIDE:
             return ''
         at = describe_target(record.target)
-        if record.ended:
-            return f'; the insertion to {at} has ended ({record.ended}): retract the needle'
+        if why := record.over(state):
+            remedy = self._retract('the needle', float(record.depths[0]))
+            return f'; the insertion to {at} has ended ({why}): {remedy}'
         return (
             f'; the insertion to {at} was interrupted in step {len(record.plans)} of '
             f'{len(record.depths) - 1}: send its target again to resume it, or retract the needle'
@@ -72,9 +77,19 @@ class InsertionPlanner:
                 try:
                     record.check(request.at, tip, state, self.settings)
                 except JobError as error:
-                    raise _cannot_resume(error, begun) from error
+                    raise self._cannot_resume(error, begun) from error
                 return request._replace(depths=np.array(record.depths), record=record)
         return request._replace(depths=self._depths(request, begun))
+
+    def _retract(self, what: str, begun: float) -> str:
+        """Return the action that permits the next insertion; the last began at a depth [m]."""
+        to, own = f'{1e3 * begun:.2f} mm', self.settings.retract_depth
+        deeper = f'set retract_depth to {to} (it is {1e3 * own:.2f} mm), and '
+        return f'{deeper if own > begun + _OUTSIDE else ""}retract {what} to {to}'
+
+    def _cannot_resume(self, error: NeedleError, begun: float) -> JobError:
+        remedy = self._retract('the needle', begun)
+        return JobError(f'the insertion cannot be resumed: {error}; {remedy} first')
 
     def resume(self, request: PlannedInsertion, law: GuardedLaw) -> None:
         """Restore a law to the record of its request, if it has one."""
@@ -84,7 +99,7 @@ class InsertionPlanner:
         try:
             record.restore(law)
         except NeedleError as error:
-            raise _cannot_resume(error, float(record.depths[0])) from error
+            raise self._cannot_resume(error, float(record.depths[0])) from error
         if np.abs(np.subtract(law.report.target, (x, z))).max() > _SAME:
             law.aim(np.array([x, z]))
 
@@ -101,8 +116,8 @@ class InsertionPlanner:
         depth, straight = max(0.0, float(at[0])), begun or 0.0
         if begun is not None and depth > begun + _OUTSIDE:
             raise JobError(
-                f'the needle is at {1e3 * depth:.2f} mm and has been steered; retract it to '
-                f'{1e3 * begun:.2f} mm first'
+                f'the needle is at {1e3 * depth:.2f} mm and has been steered; '
+                f'{self._retract("it", begun)} first'
             )
         off = np.abs(at[1:3]).max()
         if depth > straight + _OUTSIDE and off > settings.guide_tolerance:
@@ -168,13 +183,6 @@ class InsertionPlanner:
         if job is not None:
             job.cancel()
         return request
-
-
-def _cannot_resume(error: NeedleError, begun: float) -> JobError:
-    return JobError(
-        f'the insertion cannot be resumed: {error}; retract the needle to {1e3 * begun:.2f} mm '
-        'first'
-    )
 
 
 def describe_target(point: tuple[float, float, float]) -> str:

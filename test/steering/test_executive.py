@@ -694,7 +694,10 @@ def test_stop_brings_needle_and_guide_to_rest() -> None:
     assert robot.aim() == 'target rejected: stopped: requested by a user; ~/clear_stop releases'
     assert robot.request(CLEAR_STOP)
     robot.tick(200)
-    assert 'has been steered; retract it to 0.00 mm first' in robot.aim()
+    assert robot.aim().endswith(
+        'has been steered; set retract_depth to 0.00 mm (it is 10.00 mm), and retract it to '
+        '0.00 mm first'
+    )
 
 
 @pytest.mark.requirement('S-125')

@@ -171,6 +171,8 @@ def test_newest_target_is_the_one_to_send_again(restarts: int) -> None:
 
 
 MOVED = 'outside its last motion'
+#: A retraction would end too deep with the settings of the tests.
+DEEPER = 'set retract_depth to 0.00 mm (it is 10.00 mm), and '
 
 
 @pytest.mark.requirement('S-226', 'S-228', 'S-229')
@@ -215,7 +217,9 @@ def test_contradicted_record_names_the_action(event: str, reason: str) -> None:
     said = rig.aim()
     assert 'the insertion cannot be resumed: ' in said
     assert reason in said
-    assert said.endswith('; retract the needle to 0.00 mm first')
+    assert said.endswith(f'; {DEEPER}retract the needle to 0.00 mm first')
+    if event in ('stop', 'pause'):
+        assert f'paused or retracted): {DEEPER}retract the needle to 0.00 mm' in rig.said
     rig.tick(50)
     assert rig.sent == []
     assert rig.loop.phase is SteeringPhase.IDLE
@@ -243,11 +247,34 @@ def test_ended_insertion_is_not_resumed(whole: Rig) -> None:
     rig.keep()
     rig.restart()
     rig.tick(50)
-    assert 'has ended (requested by a user): retract the needle' in rig.said
+    assert f'has ended (requested by a user): {DEEPER}retract the needle' in rig.said
     assert 'cannot be resumed: requested by a user' in rig.aim()
     assert rig.request(RETRACT)
     rig.tick(3000)
     assert json.loads(whole.text)['ended'] == 'it is done'
+
+
+@pytest.mark.requirement('S-228', 'S-229')
+@pytest.mark.parametrize('own', [0.0, 5e-4, 2e-3, SETTINGS.retract_depth])
+def test_retraction_after_a_restart_permits_the_next_insertion(own: float) -> None:
+    """Or the state and the rejection name `retract_depth` as the setting to reduce."""
+    settings = replace(SETTINGS, retract_depth=own)
+    rig = Rig(settings)
+    rig.begin(1300)
+    rig.restart(settings)
+    rig.tick(300)
+    assert 'send its target again to resume it' in rig.said
+    assert rig.request(RETRACT)
+    rig.tick(3000)
+    assert rig.loop.phase is SteeringPhase.IDLE
+    assert 'resume' not in rig.said
+    rejection = rig.aim()
+    if own <= 1e-3:
+        assert rejection == ''
+        return
+    action = f'set retract_depth to 0.00 mm (it is {1e3 * own:.2f} mm), and retract the needle'
+    assert f'has ended (the system was stopped, paused or retracted): {action}' in rig.said
+    assert rejection.endswith(f'; {action} to 0.00 mm first')
 
 
 def test_invalid_record_is_an_error() -> None:
