@@ -172,9 +172,12 @@ class GuardedLaw:
     def update(self, readings: TipMeasurements, at: int, depth: float | None = None) -> None:
         """Pass a measurement at a depth number to the law; it may have no readings."""
         depth = float(self.depths[at]) if depth is None else depth
+        first = self._ahead is None
         self._take(readings.average(self._noise), at, depth)
         if at == 0 and self._aside > HIT:
             self._events.add(Severity.WARNING, self._frame())
+        if first and self._ahead is not None and abs(self._ahead) > HIT:
+            self._events.add(Severity.WARNING, self._zero(depth))
 
     def _take(self, measured: AveragedTipMeasurement | None, at: int, depth: float) -> None:
         self.measured = measured
@@ -209,6 +212,8 @@ class GuardedLaw:
         ahead = float(measured.tip[1]) - depth
         if self._ahead is None:
             self._ahead = ahead
+            if abs(ahead) > self._settings.slip_tolerance:
+                raise SteeringFaultError(self._zero(depth))
         slipped = ahead - self._ahead
         if abs(slipped) <= self._settings.slip_tolerance:
             return
@@ -219,6 +224,14 @@ class GuardedLaw:
         raise SteeringFaultError(
             f'the tip is {1e3 * abs(slipped):.2f} mm {"less" if slipped < 0.0 else "more"} deep '
             'than the needle was inserted: the needle slips, or the sensor measures another needle'
+        )
+
+    def _zero(self, depth: float) -> str:
+        at, most = depth + (self._ahead or 0.0), self._settings.slip_tolerance
+        return (
+            f'the first measurement of the tip is y = {1e3 * at:.2f} mm at an insertion depth of '
+            f'{1e3 * depth:.2f} mm, at most {1e3 * most:g} mm apart are valid (slip_tolerance): '
+            'correct the zero of the insertion depth or the origin of the tip sensor'
         )
 
     def _check_sensor(self, tip: FloatArray | None) -> None:

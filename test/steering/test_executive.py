@@ -92,6 +92,7 @@ def test_insertion_hits_the_target_with_a_consistent_estimate() -> None:
     )  # fmt: skip
 
 
+@pytest.mark.requirement('S-338')
 def test_miss_in_depth_is_a_warning() -> None:
     """The sensor measures the tip 2 mm short; the needle is at its insertion depth."""
     robot = Robot()
@@ -100,6 +101,11 @@ def test_miss_in_depth_is_a_warning() -> None:
     severity, line, _ = robot.loop.diagnose(robot.now)
     assert robot.loop.phase is Phase.DONE
     assert severity is Severity.WARNING
+    assert [
+        line
+        for severity, line in robot.loop.events.take()
+        if severity is Severity.WARNING and line.startswith('the first measurement of the tip is')
+    ]
     # A bent needle is 0.1 mm less deep than its insertion depth.
     assert re.search(
         r'y = (57\.[89]|58\.0)\d ± .* 2\.\d\d mm from the target, at most 2.\d\d mm$', line
@@ -159,6 +165,30 @@ def test_tip_far_from_the_guide_stops_before_the_insertion() -> None:
     assert robot.loop.phase is Phase.STOPPED
     assert 'the tip is 1760 mm beside the guide before the insertion' in robot.loop.fault
     assert not robot.at.any()
+
+
+@pytest.mark.requirement('S-338')
+@pytest.mark.parametrize('settings', [SETTINGS, CONTINUOUS])
+@pytest.mark.parametrize('shift', [-0.022, -6e-3, -3.3e-3, -2.7e-3, 2.7e-3, 3.3e-3, 6e-3, 0.022])
+def test_tip_that_is_not_at_the_insertion_depth_stops_before_the_insertion(
+    shift: float, settings: ExecutiveSettings
+) -> None:
+    """By more than `slip_tolerance`, as for a shifted origin or an encoder without its zero."""
+    robot = Robot(settings, law='open_loop')
+    robot.sees = lambda tip: np.add(tip, (0.0, shift, 0.0))
+    robot.steer()
+    if abs(shift) < SETTINGS.slip_tolerance:
+        assert robot.loop.phase is Phase.DONE
+        return
+    assert robot.loop.phase is Phase.STOPPED
+    assert not robot.at.any()
+    # Five standard deviations of a mean of 19 readings of 0.18 mm.
+    found = re.match(
+        r'the first measurement of the tip is y = (.*) mm at an insertion depth of 0\.00 mm, ',
+        robot.loop.fault,
+    )
+    assert found is not None
+    assert float(found[1]) == pytest.approx(1e3 * shift, abs=5.0 * 0.18 / np.sqrt(19.0))
 
 
 @pytest.mark.requirement('S-124')
