@@ -20,6 +20,7 @@ from needle_ros.errors import ParameterError
 from needle_ros.event_log import EventLog, Severity
 from needle_ros.quantities import DEVIATION_OVER_MEDIAN, NORMAL
 import numpy as np
+from scipy.special import stdtrit
 
 _OUTLIER: Final = 5.0  #: Distance of an outlier from the median, in standard deviations.
 _FARTHEST: Final = 0.1  #: Largest distance of the tip from the guide before an insertion [m].
@@ -263,15 +264,26 @@ class GuardedLaw:
         shift = f'the tip was {1e3 * self._aside:.2f} mm beside the guide before the insertion'
         return f'{shift}: tilt of the guide, or origin of the sensor, whose frame the target has'
 
+    def _half_width(self, measured: AveragedTipMeasurement) -> float:
+        """Return half the 95 % interval of a coordinate of a measurement by itself [m]."""
+        # Readings of one measurement may have a common error; all measurements show it along y.
+        taken = [entry for entry in self.history if entry.get('tip') is not None]
+        ahead = [entry['tip'][1] - entry['depth'] for entry in taken]
+        half, free = NORMAL * max(measured.error, self._noise), len(ahead) - 1
+        if free < 1:
+            return half
+        return max(half, float(stdtrit(free, 0.975) * np.std(ahead, ddof=1)))
+
     def outcome(self) -> tuple[str, Severity]:
         """Describe the tip at the end; a warning unless it is within 1 mm with its interval."""
         there, measured = self.expected, self.measured
         if measured is None:
             return 'the needle is at the target depth; its tip is not measured', Severity.WARNING
-        # The law estimates x and z from all measurements.
-        tip, half = measured.tip.copy(), np.full(3, NORMAL * max(measured.error, self._noise))
+        tip, half = measured.tip.copy(), np.full(3, self._half_width(measured))
         if there is not None:
+            # The law estimates x and z from all measurements; their slow error is that of y, too.
             tip[[0, 2]], half[[0, 2]] = there.mean, there.half_width
+            half[1] = half.max()
         x, z = self.report.target
         miss = float(np.linalg.norm(tip - (x, self.depths[-1], z)))
         most = miss + float(half.max())
