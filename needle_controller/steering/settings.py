@@ -179,8 +179,8 @@ class ExecutiveSettings(SteeringLimits):
         0.02, 'rad', 'largest difference of the roll at rest from its goal', open_low=True
     )
     slip_tolerance: float = constant(
-        3e-3, 'm', 'largest change of the difference between tip depth and insertion depth '
-        'since the first measurement', open_low=True,
+        3e-3, 'm', 'largest difference between tip depth and insertion depth at the first '
+        'measurement, and its largest change', open_low=True,
     )  # fmt: skip
     retract_depth: float = constant(
         RETRACT_DEPTH, 'm', 'insertion depth of ~/retract; a needle that is less deep rests'
