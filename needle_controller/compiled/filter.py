@@ -2,8 +2,7 @@
 """
 Filter of the observer: history, step of one sample, and estimate at the present depth.
 
-Over one sample the depth is frozen at its mean. The history of the filter is kept sample by
-sample, so that a late measurement is processed at its time.
+Over one sample the depth is frozen at its mean. A late measurement is processed at its time.
 """
 
 from __future__ import annotations
@@ -378,14 +377,12 @@ def expose(
     deflection: float,
 ) -> int:
     """
-    Insert the exposure of a tip sample, ``start`` to ``end`` [s], and repeat the later steps.
+    Insert the exposure of a tip sample [s], repeat the later steps, and return the new ``count``.
 
-    It may overlap with its neighbors, or the time before the history, by ``slack`` [s], which is
-    cut off. Returns the new number of exposures, or -1 if the sample is refused.
+    An overlap with others or the time before the history is cut off; -1 if it exceeds ``slack``.
     """
     f = boxed.value
-    exposures, first = f.exposures, f.samples[oldest]['time']
-    place = count
+    exposures, first, place = f.exposures, f.samples[oldest]['time'], count
     while place > 0 and exposures[place - 1, 1] > end:
         place -= 1
     floor = max(first, exposures[place - 1, 1]) if place > 0 else first
