@@ -138,7 +138,7 @@ class Measurement(NamedTuple):
 
 
 NO_SETPOINT: Final = Setpoint(nan)  #: Setpoint of a command without a reference.
-_REST: Final = Setpoint(0.0)
+_REST: Final = Setpoint(0.0)  #: Setpoint of the rotation.
 
 
 class ControllerOutput(NamedTuple):

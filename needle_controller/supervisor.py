@@ -23,7 +23,7 @@ from needle_ros.errors import JobError, NeedleError, ParameterError
 from needle_ros.event_log import Severity
 from needle_ros.requests import RequestAction, Verdict, WaitingRequests
 from needle_ros.status import ControllerPhase, ControllerStatus
-from needle_ros.system_state import CLEAR_STOP, Mode, RETRACT, STOP
+from needle_ros.system_state import CLEAR_STOP, Mode, RETRACT, STOP, STOPPED
 from needle_ros.timing import NANOSECONDS
 from needle_ros.trajectories import JointPath
 from needle_ros.wire import Reading
@@ -208,7 +208,7 @@ class Supervisor(StateMachine[ForceCommand]):
             if self._active is None:
                 raise JobError('the controller is not active')
             if self.safety.stop is not None:
-                raise JobError(f'stopped: {self.safety.stop}; ~/clear_stop releases')
+                raise JobError(f'{STOPPED}{self.safety.stop}; ~/clear_stop releases')
             request.act(self._active, elapsed)
             self._end_retraction()
         except (JobError, ParameterError) as error:
@@ -242,7 +242,7 @@ class Supervisor(StateMachine[ForceCommand]):
 
     def _stop(self, reason: str, now: int) -> ForceCommand:
         self.safety.latch(reason)
-        self._waiting.end(f'stopped: {reason}')
+        self._waiting.end(f'{STOPPED}{reason}')
         self.bending.forget()
         self.fault, self._kind = reason, FaultKind.STOP
         if self.controller is not None:

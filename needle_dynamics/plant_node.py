@@ -23,7 +23,7 @@ from needle_ros.publishers_node import offer_lease
 from needle_ros.run_node import run
 from needle_ros.settings import LARGEST_SEED
 from needle_ros.status import Diagnosis, PlantPhase, PlantStatus
-from needle_ros.system_state import Authority, Mode
+from needle_ros.system_state import Authority, Mode, STOPPED
 from needle_ros.system_state_node import SystemStateTopics
 from needle_ros.timing import NANOSECONDS
 from needle_ros.wire import Reading
@@ -296,7 +296,7 @@ class PlantNode(ModelNode):
         self._mode = mode
         if self._run is None or not new:
             return
-        self._trajectories.stopped = f'stopped: {reason}' if reason else ''
+        self._trajectories.stopped = f'{STOPPED}{reason}' if reason else ''
         if Mode.STOPPED in (mode, before):
             self._trajectories.end(self._trajectories.stopped or 'sent during a stop')
         if mode is Mode.STOPPED:

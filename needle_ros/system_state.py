@@ -37,6 +37,8 @@ CLEAR_STOP: Final = 'clear_stop'
 PAUSE: Final = 'pause'
 RESUME: Final = 'resume'
 RETRACT: Final = 'retract'
+#: Begin of the reason for which each node of a stopped system rejects a motion.
+STOPPED: Final = 'stopped: '
 REQUESTS: Final = (STOP, CLEAR_STOP, PAUSE, RESUME, RETRACT)
 
 
@@ -212,7 +214,7 @@ class Authority:
         if word == CLEAR_STOP and not stopped:
             return True, 'there was no stop'
         if word != CLEAR_STOP and stopped:
-            obstacle = f'stopped: {stopped}; ~/clear_stop releases'
+            obstacle = f'{STOPPED}{stopped}; ~/clear_stop releases'
         if obstacle:
             return False, f'{word} refused: {obstacle}'
         if word == CLEAR_STOP:

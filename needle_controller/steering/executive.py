@@ -40,7 +40,7 @@ from needle_ros.event_log import Severity
 from needle_ros.requests import RequestStatus, Verdict
 from needle_ros.status import SteeringPhase as Phase
 from needle_ros.status import SteeringStatus
-from needle_ros.system_state import Mode, RETRACT
+from needle_ros.system_state import Mode, RETRACT, STOPPED
 from needle_ros.wire import Reading
 import numpy as np
 
@@ -50,9 +50,6 @@ _JUMPS: Final = (5e-3, 5e-3, 5e-3, 1.0)
 #: Tolerance of a joint during a measurement, as a multiple of its tolerance at arrival: a needle
 #: that settles at the limit does not end the insertion.
 _LEFT: Final = 1.5
-
-#: Begin of the reason why a stopped node rejects a request.
-_STOPPED: Final = 'stopped: '
 
 _MOVING: Final = (Phase.GUIDING, Phase.INSERTING, Phase.RETRACTING)
 
@@ -188,7 +185,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
     def _check_mode(self) -> None:
         """Raise `JobError` if the system does not permit an insertion now."""
         if self.authority.reason:
-            raise JobError(f'{_STOPPED}{self.authority.reason}; ~/clear_stop releases')
+            raise JobError(f'{STOPPED}{self.authority.reason}; ~/clear_stop releases')
         if self.phase is Phase.RETRACTING:
             raise JobError('the needle is withdrawn; wait until it rests, or stop it')
         if self._obeyed is Mode.PAUSED and not self.steers:
@@ -267,7 +264,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
             self.requests.supersede(now)
         if mode is Mode.STOPPED:
             if not (self.steers or self._moves):
-                self.events.add(Severity.ERROR, f'{_STOPPED}{self.authority.reason}')
+                self.events.add(Severity.ERROR, f'{STOPPED}{self.authority.reason}')
             return self.halt(self.authority.reason, now)
         self._motions.discard_stop()
         if mode is Mode.RETRACTING:
@@ -300,7 +297,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
     def halt(self, why: str, now: int) -> JointMotion | None:
         """End the insertion or retraction for a reason: brake to rest, and cancel a plan."""
         self.requests.supersede(now)
-        self._cancel(Verdict.REJECTED, f'{_STOPPED}{why}')
+        self._cancel(Verdict.REJECTED, f'{STOPPED}{why}')
         moves = self._moves
         if not (self.steers or moves):
             return None
@@ -308,7 +305,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         if self._obeyed is Mode.RETRACTING:
             self._retraction = Retraction(self._motions, self.settings, self.events)
         self._motions.monitor.forget()
-        self.events.add(Severity.ERROR, f'{_STOPPED}{why}')
+        self.events.add(Severity.ERROR, f'{STOPPED}{why}')
         return self._motions.stop(now) if moves else None
 
     def receive(self, node: str, status: RequestStatus, now: int) -> JointMotion | None:
@@ -320,7 +317,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
             return self._stop(str(refusal), now)
         if self._retraction is not None:
             self._retraction.refuse(refusal)
-        elif self.phase is Phase.STOPPED and not refusal.reason.startswith(_STOPPED):
+        elif self.phase is Phase.STOPPED and not refusal.reason.startswith(STOPPED):
             # A node that is stopped itself rejects the motion to rest, too.
             self.events.add(Severity.ERROR, f'the stop failed: {refusal}')
         return None
@@ -452,7 +449,7 @@ class SteeringExecutive(StateMachine[JointMotion]):
         )
         failure = '' if self._retraction is None else self._retraction.failure
         if self.authority.reason:
-            failure = f'{_STOPPED}{self.authority.reason}'
+            failure = f'{STOPPED}{self.authority.reason}'
         depth, state = float(self._motions.at[0]), self.authority.state.newest
         advice = '' if insertion else self.planner.advice(depth, state)
         return (*summarize(status, insertion, failure, advice), status)

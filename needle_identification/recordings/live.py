@@ -76,7 +76,7 @@ class LiveRecording:
         #: Stamp of the newest sample of each topic [ns], and number of samples.
         self._newest: dict[str, int] = {}
         self._counts = dict.fromkeys(self._series, 0)
-        self._checked = 0  #: Number of samples at the last check.
+        self._checked = dict(self._counts)  #: Number of samples at the last check.
         #: Sample with a stamp far ahead, until the next sample of its topic.
         self._ahead: dict[str, tuple[int, tuple[float, ...]]] = {}
 
@@ -126,13 +126,14 @@ class LiveRecording:
         Raises
         ------
         RecordingError
-            Without a new sample of both topics since the last call, or if the newest stamps of the
-            topics differ by more than a second.
+            If a topic has no new sample since the last call, or if the newest stamps of the topics
+            differ by more than a second.
 
         """
         if not self.samples:
             return
-        before, self._checked = self._checked, self.samples
+        silent = [name for name, count in self._counts.items() if count == self._checked[name]]
+        self._checked = dict(self._counts)
         (one, first), (other, second) = sorted(self._newest.items(), key=lambda item: item[1])
         if second - first > _JUMP:
             apart = (second - first) / NANOSECONDS
@@ -140,8 +141,8 @@ class LiveRecording:
                 f'{one} is {apart:.3g} s older than {other}: it is not published any more, or the '
                 'clocks of the publishers differ'
             )
-        if self.samples == before:
-            raise RecordingError(f'no new samples of {one} and {other}')
+        if silent:
+            raise RecordingError(f'no new samples of {" and ".join(silent)}')
 
     def recording(self) -> Recording:
         """Return the kept samples; `RecordingError` if force and motion do not overlap in time."""

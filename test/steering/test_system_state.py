@@ -15,23 +15,12 @@ from needle_ros.system_state import Authority, CLEAR_STOP, PAUSE, RESUME, RETRAC
 import numpy as np
 from numpy.testing import assert_allclose
 import pytest
-from support.steered_robot import CONTINUOUS, Robot, SETTINGS, TARGET
+from support.steered_robot import inserted, Robot, SETTINGS, TARGET
 
 #: Largest displacement after a request [m]: braking from 10 mm/s within 0.2 s, and a period.
 BRAKED = 1.1e-3
 
 STRATEGIES = pytest.mark.parametrize('continuous', [False, True])
-
-
-def inserted(continuous: bool, depth: float) -> Robot:
-    """Return a robot during an insertion, at a depth [m]."""
-    robot = Robot(CONTINUOUS if continuous else SETTINGS)
-    robot.tick(20)
-    assert robot.aim() == ''
-    while robot.at[0] < depth:
-        robot.tick()
-        assert robot.loop.steers
-    return robot
 
 
 def own_withdrawal(robot: Robot, depth: float) -> None:

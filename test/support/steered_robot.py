@@ -168,3 +168,14 @@ class Robot:
     def miss(self) -> float:
         """Distance of the tip from the target [m]."""
         return float(np.hypot(*(self.needle.tip[[0, 2]] - np.array(TARGET)[[0, 2]])))
+
+
+def inserted(continuous: bool, depth: float) -> Robot:
+    """Return a robot during an insertion, at a depth [m]."""
+    robot = Robot(CONTINUOUS if continuous else SETTINGS)
+    robot.tick(20)
+    assert robot.aim() == ''
+    while robot.at[0] < depth:
+        robot.tick()
+        assert robot.loop.steers
+    return robot
