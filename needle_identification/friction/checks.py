@@ -2,6 +2,7 @@
 """Plausibility checks of a friction estimate: errors and warnings."""
 
 from collections.abc import Iterator, Sequence
+from math import sqrt
 from typing import Final
 
 from needle_identification.errors import IdentificationError
@@ -14,6 +15,7 @@ import numpy as np
 
 _UNUSUAL_LAG: Final = 0.01  # largest lag of usual sensor filters [s]
 _MUCH_LARGER: Final = 1.5  # growth of the errors by autocorrelated noise for a warning
+_MORE_THAN_NOISE: Final = 1.2  # mu_v times noise of the velocity over the residual
 _DOUBT: Final = 1e-4  # p-value of the terms at reversals for a warning
 _WANDERS: Final = 0.25  # part of the recording: longer correlation is not finite
 _FRICTION: Final = ('coulomb_friction', 'viscous_friction')
@@ -138,6 +140,11 @@ def noise_bias(design: Design, fit: Regression) -> float:
         return 0.0
     k = names.index('viscous_friction')
     if not fit.determined[k]:
+        return 0.0
+    # The noise of the velocity is part of the residual. More was found where a slow sampling does
+    # not resolve the motion.
+    spread = np.linalg.norm(fit.residual) / sqrt(fit.samples)
+    if abs(fit.values[k]) * noise > _MORE_THAN_NOISE * spread:
         return 0.0
     x = design.regressors(settings.terms).take(design.rows, axis=0)[:, : len(columns)]
     bias = float(fit.values[k] * fit.samples * noise**2 * np.linalg.pinv(x.T @ x)[k, k])

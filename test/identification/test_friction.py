@@ -22,6 +22,7 @@ from needle_identification.friction.filtering import _smooth, filter_taps
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
+from scipy.integrate import cumulative_trapezoid
 from scipy.signal.windows import hann
 from support.strokes import COULOMB, NOISE, SPEEDS, strokes, VISCOUS
 
@@ -375,6 +376,25 @@ def test_total_least_squares_corrects_for_velocity_noise() -> None:
     assert not within(ordinary['viscous_friction'], VISCOUS)
     assert within(total['viscous_friction'], VISCOUS)
     assert not any('choose' in words for words in total.warnings)
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_exact_speeds_at_a_low_rate_have_no_noise(seed: int) -> None:
+    """The change of the speed between few samples is not noise of the speed."""
+    rng = np.random.default_rng(seed)
+    peaks = np.tile([10e-3, -10e-3, 20e-3, -20e-3, 30e-3, -30e-3], 5)
+
+    def speed(time: FloatArray) -> FloatArray:
+        return peaks[time.astype(int) % 30] * (1.0 - np.abs(2.0 * (time % 1.0) - 1.0))
+
+    time, fine = np.sort(rng.uniform(0.0, 60.0, 300)), np.linspace(0.0, 60.0, 60_001)
+    depth = np.interp(time, fine, cumulative_trapezoid(speed(fine), fine, initial=0.0))
+    velocity = speed(time)
+    force = COULOMB * np.sign(velocity) + VISCOUS * velocity + 0.01 * rng.normal(size=len(time))
+    found = identify_friction(Recording(time=time, depth=depth, velocity=velocity, force=force))
+    assert found.estimator == 'ordinary'
+    # Samples near a reversal differ from the terms between its neighbors: four standard errors.
+    assert all(abs(found[k].value - truth) < 4.0 * found[k].error for k, truth in TRUTH.items())
 
 
 def test_huber_is_robust_against_outliers() -> None:
