@@ -30,7 +30,7 @@ from needle_identification.stiffness.identify import (
 )
 from needle_identification.stiffness.plateaus import StiffnessSettings
 from needle_ros import contract
-from needle_ros.base_node import BaseNode, profile
+from needle_ros.base_node import BaseNode, profile, steady_timer
 from needle_ros.calls_node import Calls
 from needle_ros.errors import NeedleError, ParameterError
 from needle_ros.event_log import Severity
@@ -58,6 +58,7 @@ _COEFFICIENTS: Final = ('model.coulomb_friction', 'model.viscous_friction')
 #: the next start, as a multiple of its duration.
 _ALL: Final = profile(contract.SENSOR._replace(depth=5000), request=True)
 _REST: Final = 5.0
+_TAKE_PERIOD: Final = 0.02  # period of taking received messages [s]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,8 +110,12 @@ class IdentificationNode(BaseNode):
         self.declare_text('bags', [''], 'recordings to identify from')
         self.declare_text('what', 'friction', ' or '.join(WHAT), WHAT)
         self.declare_text('output', '', 'parameter file to write the result to; none if empty')
-        self.declare_text('wrench_topic', '', 'topic of the force; found by its type if empty')
-        self.declare_text('motion_topic', '', 'topic of the motion; found by its type if empty')
+        self.declare_text(
+            'wrench_topic', '', 'of a bag, topic of the force; found by its type if empty'
+        )
+        self.declare_text(
+            'motion_topic', '', 'of a bag, topic of the motion; found by its type if empty'
+        )
         self.declare_text('force_axis', 'y', 'friction: axis of the force, may be signed: -x')
         self.declare_text(
             'motion_axis',
@@ -138,7 +143,7 @@ class IdentificationNode(BaseNode):
     def configure(self) -> None:
         """Read the recordings, axes and settings of identification."""
         self.text('what', WHAT)
-        self.text('time', TIMES)
+        self._by_header = self.text('time', TIMES) == 'header'
         self.settings('friction.', FrictionSettings)
         self.settings('stiffness.', StiffnessSettings)
         self.settings('', IdentificationSettings)
@@ -180,10 +185,11 @@ class IdentificationNode(BaseNode):
         if self._is_live:
             self._doubts = ''
             self._live = LiveRecording(self.settings('', IdentificationSettings).window)
-            self._listening = (
-                self.listen(contract.JOINT_STATES, self._on_motion, qos=_ALL),
-                self.listen(contract.BASE_WRENCH, self._on_force, qos=_ALL),
+            self._queues = (
+                self.queue(contract.JOINT_STATES, self._on_motion, _ALL),
+                self.queue(contract.BASE_WRENCH, self._on_force, _ALL),
             )
+            self._taking = steady_timer(self, _TAKE_PERIOD, self._take)
             self._timer = self.create_timer(1.0, self._identify_live)
 
     def about(self) -> str:
@@ -194,8 +200,9 @@ class IdentificationNode(BaseNode):
     def deactivate(self) -> None:
         if self._is_live:
             self.destroy_timer(self._timer)
-            for subscription in self._listening:
-                self.destroy_subscription(subscription)
+            self.destroy_timer(self._taking)
+            for subscription, _ in self._queues:
+                subscription.destroy()
 
     def change(self, changes: Mapping[str, Any]) -> None:
         self._bags = [name for name in changes['bags'] if name]
@@ -289,17 +296,24 @@ class IdentificationNode(BaseNode):
 
     # Running topics.
 
-    def _on_motion(self, reading: Reading) -> None:
+    def _take(self) -> None:
+        for _, take_all in self._queues:
+            take_all()
+
+    def _on_motion(self, reading: Reading, received: int) -> None:
         factor, joint = self._joint
         found = reading.joint(joint)
         if self._live is not None and found is not None:
             position, velocity, _ = found
-            self._live.take_motion(reading.stamp, factor * position, factor * velocity)
+            stamp = reading.stamp if self._by_header else received
+            self._live.take_motion(stamp, factor * position, factor * velocity, received)
 
-    def _on_force(self, reading: Reading) -> None:
+    def _on_force(self, reading: Reading, received: int) -> None:
         if self._live is not None:
             factor, axis = self._force_axis
-            self._live.take_force(reading.stamp, factor * reading.values[0][AXES.index(axis)])
+            force = factor * reading.values[0][AXES.index(axis)]
+            stamp = reading.stamp if self._by_header else received
+            self._live.take_force(stamp, force, received)
 
     def _identify_live(self) -> None:
         """Identify, and publish the result; at most a fifth of the time is spent here."""

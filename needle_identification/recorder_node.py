@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 from needle_identification.bags.topics import DURATIONS, OfferedQos, WORDS
 from needle_identification.bags.writer import BagWriter, COMPRESSIONS, described
 from needle_identification.errors import RecordingError
-from needle_ros.base_node import BaseNode, message_class, steady_timer
+from needle_ros.base_node import BaseNode, message_class, messages_of, steady_timer
 from needle_ros.contract import BASE_WRENCH, JOINT_STATES, RECORDED, TOPICS
 from needle_ros.errors import MessageError
 from needle_ros.event_log import Severity
@@ -217,24 +217,19 @@ class RecorderNode(BaseNode):
             self._reports.publish(message)
 
     def _take_from(self, bag: BagWriter, topic: str, recorded: _Recorded, most: int) -> None:
-        handle, kind, data = recorded.subscription.handle, recorded.kind, b''
-        with handle:
-            for _ in range(most):
-                taken = handle.take_message(kind, True)
-                if taken is None:
-                    break
-                data, about = taken
-                # Not every middleware reports the receive time and the sequence number.
-                bag.write(topic, data, about['received_timestamp'] or time.time_ns())
-                number = about['publication_sequence_number']
-                if number is None:
-                    continue
-                newest = self._newest.get(topic, number)
-                self._newest[topic] = max(number, newest)
-                # Each publisher has its own sequence numbers; a new one may not be recorded yet.
-                single = len(recorded.offered) == 1
-                if number > newest + 1 and single and self.count_publishers(topic) == 1:
-                    bag.lost[topic] += number - newest - 1
+        data = b''
+        for data, about in messages_of(recorded.subscription, recorded.kind, most):
+            # Not every middleware reports the receive time and the sequence number.
+            bag.write(topic, data, about['received_timestamp'] or time.time_ns())
+            number = about['publication_sequence_number']
+            if number is None:
+                continue
+            newest = self._newest.get(topic, number)
+            self._newest[topic] = max(number, newest)
+            # Each publisher has its own sequence numbers; a new one may not be recorded yet.
+            single = len(recorded.offered) == 1
+            if number > newest + 1 and single and self.count_publishers(topic) == 1:
+                bag.lost[topic] += number - newest - 1
         if data and topic in self._sampled:
             with suppress(MessageError):
                 stamp = self._sampled[topic](data).stamp
@@ -287,8 +282,7 @@ class RecorderNode(BaseNode):
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
             raw=True,
         )
-        # The executor would take single messages, without sequence number and receive time.
-        self._subscriptions.remove(subscription)
+        self.take_over(subscription)
         self._recorded[topic] = _Recorded(kind, subscription, best_effort, latched, offered)
 
 

@@ -2,9 +2,10 @@
 """Base class of all nodes: life cycle, contract topics, diagnostics."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from importlib import import_module
+from time import time_ns
 import traceback
 from typing import Any, ClassVar
 
@@ -56,7 +57,20 @@ def steady_timer(node: Node, period: float, act: Callable[[], object]) -> Timer:
     return node.create_timer(period, act, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-def _nothing() -> None:
+def messages_of(
+    subscription: Subscription, kind: Any, most: int
+) -> Iterator[tuple[bytes, dict[str, Any]]]:
+    """Take the received messages of a raw subscription, with their receive time and number."""
+    handle: Any = subscription.handle
+    with handle:
+        for _ in range(most):
+            taken = handle.take_message(kind, True)
+            if taken is None:
+                break
+            yield taken
+
+
+def _nothing(*_: object) -> None:
     pass
 
 
@@ -188,9 +202,54 @@ class BaseNode(ParameterNode):
 
         ``qos`` is the requested QoS, by default that of the topic.
         """
-        name, read = topic.name, MessageReader(topic.type_name).read
+        taken = self._parsed(topic, lambda reading, _: take(reading))
+
+        def on_match(event: Any) -> None:
+            if matched is not None:
+                matched(event.total_count_change)
 
         def on_bytes(data: bytes) -> None:
+            taken(data, 0)
+
+        events = SubscriptionEventCallbacks(matched=on_match)
+        return self.create_subscription(
+            message_class(topic.type_name),
+            topic.name,
+            on_bytes,
+            qos or profile(topic.qos, request=True),
+            raw=True,
+            event_callbacks=events,
+        )
+
+    def queue(
+        self, topic: Topic, take: Callable[[Reading, int], None], qos: QoSProfile
+    ) -> tuple[Subscription, Callable[[], None]]:
+        """
+        Subscribe, with a function that takes all messages, each with its receive time [ns].
+
+        The receive time is that of the middleware, however late the message is taken.
+        """
+        kind, taken = message_class(topic.type_name), self._parsed(topic, take)
+        subscription = self.create_subscription(kind, topic.name, _nothing, qos, raw=True)
+        self.take_over(subscription)
+
+        def take_all() -> None:
+            for data, about in messages_of(subscription, kind, qos.depth):
+                taken(data, about['received_timestamp'] or time_ns())
+
+        return subscription, take_all
+
+    def take_over(self, subscription: Subscription) -> None:
+        """Keep the executor from taking messages: it would do so without their receive time."""
+        self._subscriptions.remove(subscription)
+
+    def _parsed(
+        self, topic: Topic, take: Callable[[Reading, int], None]
+    ) -> Callable[[bytes, int], None]:
+        """Return a function that parses a message, or counts and reports an invalid one."""
+        name, read = topic.name, MessageReader(topic.type_name).read
+
+        def taken(data: bytes, received: int) -> None:
             try:
                 reading = read(data)
             except MessageError as error:
@@ -199,21 +258,9 @@ class BaseNode(ParameterNode):
                     f'invalid message on {name}: message {error}', throttle_duration_sec=1.0
                 )
                 return
-            take(reading)
+            take(reading, received)
 
-        def on_match(event: Any) -> None:
-            if matched is not None:
-                matched(event.total_count_change)
-
-        events = SubscriptionEventCallbacks(matched=on_match)
-        return self.create_subscription(
-            message_class(topic.type_name),
-            name,
-            on_bytes,
-            qos or profile(topic.qos, request=True),
-            raw=True,
-            event_callbacks=events,
-        )
+        return taken
 
     def destroy_timer(self, timer: Timer) -> bool:
         # EventsExecutor can call a destroyed timer once more.

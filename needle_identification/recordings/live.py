@@ -2,7 +2,7 @@
 """The newest samples of running topics as a recording."""
 
 from collections import Counter
-from math import isfinite, nan
+from math import isfinite, isnan, nan
 from typing import Final
 
 from needle_dynamics.arrays import IntArray
@@ -28,7 +28,8 @@ class LiveRecording:
     The newest samples of running topics, as a recording of their last motions.
 
     Invalid samples are counted in ``dropped``. A clock that is set back discards all earlier
-    samples; a single stamp in the future is discarded.
+    samples; a single stamp in the future is discarded. With receive times, a clock offset between
+    the topics of up to a second is corrected as in a bag.
 
     Parameters
     ----------
@@ -68,7 +69,8 @@ class LiveRecording:
         self._restart()
 
     def _restart(self) -> None:
-        self._series = {BASE_WRENCH.name: Series(1), JOINT_STATES.name: Series(3)}
+        #: Force, and depth, velocity and its validity; last the latency [ns].
+        self._series = {BASE_WRENCH.name: Series(2), JOINT_STATES.name: Series(4)}
         #: Added samples: stamps and values.
         self._added: dict[str, tuple[list[int], list[tuple[float, ...]]]] = {
             name: ([], []) for name in self._series
@@ -79,25 +81,56 @@ class LiveRecording:
         self._checked = dict(self._counts)  #: Number of samples at the last check.
         #: Sample with a stamp far ahead, until the next sample of its topic.
         self._ahead: dict[str, tuple[int, tuple[float, ...]]] = {}
+        self._unstamped: Counter[str] = Counter()
+        self._has_depth = False
 
     @property
     def samples(self) -> int:
         """Number of samples since the start of the topic that has fewer of them."""
         return min(self._counts.values())
 
-    def take_motion(self, stamp: int, depth: float, velocity: float = nan) -> None:
-        """Add depth [m] and velocity [m/s], NaN if not measured, at a stamp [ns]."""
+    def take_motion(
+        self, stamp: int, depth: float, velocity: float = nan, received: int = 0
+    ) -> None:
+        """
+        Add depth [m] and velocity [m/s], NaN if not measured, at a stamp [ns].
+
+        ``received`` is the receive time [ns], 0 if unknown; it replaces a stamp of 0. Velocities
+        without any depth are integrated.
+        """
         known = abs(velocity) <= _LARGEST[JOINT_STATES.name]
-        self._take(JOINT_STATES.name, stamp, (depth, velocity if known else 0.0, float(known)))
+        if isfinite(depth) and not self._has_depth:
+            self._has_depth = True
+            self._forget_motion()
+        elif isnan(depth) and known and not self._has_depth:
+            depth = 0.0
+        values = depth, velocity if known else 0.0, float(known)
+        self._take(JOINT_STATES.name, stamp, received, values)
 
-    def take_force(self, stamp: int, force: float) -> None:
-        """Add the base force on the needle [N], positive into the tissue, at a stamp [ns]."""
-        self._take(BASE_WRENCH.name, stamp, (force,))
+    def _forget_motion(self) -> None:
+        """Discard the velocities before the first depth."""
+        name = JOINT_STATES.name
+        if count := self._counts[name]:
+            self.dropped['not finite'] += count
+            self._series[name], self._added[name] = Series(4), ([], [])
+            self._counts[name] = 0
 
-    def _take(self, name: str, stamp: int, values: tuple[float, ...]) -> None:
-        if not abs(values[0]) <= _LARGEST[name]:
-            self.dropped['implausible' if isfinite(values[0]) else 'not finite'] += 1
+    def take_force(self, stamp: int, force: float, received: int = 0) -> None:
+        """
+        Add the base force on the needle [N], positive into the tissue, at a stamp [ns].
+
+        ``received`` is the receive time [ns], as of the motion.
+        """
+        self._take(BASE_WRENCH.name, stamp, received, (force,))
+
+    def _take(self, name: str, stamp: int, received: int, measured: tuple[float, ...]) -> None:
+        if not abs(measured[0]) <= _LARGEST[name]:
+            self.dropped['implausible' if isfinite(measured[0]) else 'not finite'] += 1
             return
+        if received and not stamp:
+            self._unstamped[name] += 1
+            stamp = received
+        values = *measured, float(received - stamp) if received else 0.0
         newest, ahead = self._newest.get(name, stamp), self._ahead.pop(name, None)
         if stamp < newest - _JUMP:
             self._restart()
@@ -139,7 +172,7 @@ class LiveRecording:
             apart = (second - first) / NANOSECONDS
             raise RecordingError(
                 f'{one} is {apart:.3g} s older than {other}: it is not published any more, or the '
-                'clocks of the publishers differ'
+                'clocks of the publishers differ: time receive uses one clock'
             )
         if silent:
             raise RecordingError(f'no new samples of {" and ".join(silent)}')
@@ -153,13 +186,17 @@ class LiveRecording:
                 series.add(np.array(stamps, dtype=np.int64), np.array(values))
                 series.compact()
                 self._added[name] = [], []
+            if count := self._unstamped[name]:
+                self.losses.append(f'{count} of {name} without a stamp, the receive time is used')
             self.losses += series.losses(name)
         self._discard()
         for name, series in self._series.items():
             if len(series.stamps) < 2:
                 raise RecordingError(f'{self.path} have no samples of {name}')
         force, motion = (
-            Samples(name, series.stamps, series.values, np.zeros(1, dtype=np.int64))
+            Samples(
+                name, series.stamps, series.values[:, :-1], series.values[:, -1].astype(np.int64)
+            )
             for name, series in self._series.items()
         )
         return merged_recording(self, force, position_and_velocity(motion, self))
@@ -182,7 +219,7 @@ class LiveRecording:
         motion = self._series[JOINT_STATES.name]
         if len(motion.stamps) < 2:
             return motion.stamps
-        depth, velocity, known = motion.values.T
+        depth, velocity, known, _ = motion.values.T
         slope = np.gradient(depth, (motion.stamps - motion.stamps[0]) / NANOSECONDS)
         speed = np.abs(np.where(known > 0.0, velocity / np.maximum(known, 1e-9), slope))
         moves = speed > _MOVES * np.quantile(speed, 0.99)

@@ -121,6 +121,53 @@ def test_positions_without_velocity_are_differentiated() -> None:
     check(fed(velocities=False), 0.02)
 
 
+@pytest.mark.parametrize('offset', [-0.9, -0.4, 0.0, 0.4, 0.9])
+def test_offset_of_the_clocks_is_corrected_as_in_a_bag(offset: float) -> None:
+    """By the receive times, which have a latency of 1 ms; with the loss of a bag."""
+    live, shift = LiveRecording(1e3), round(offset * 1e9)
+    for stamp, depth, velocity, force in SAMPLES:
+        live.take_force(stamp + shift, force, stamp + 1_000_000)
+        live.take_motion(stamp, depth, velocity, stamp + 1_000_000)
+    recording = live.recording()
+    assert recording.clock_offset == pytest.approx(offset, abs=1e-6)
+    assert ('clocks differ, corrected' in '; '.join(recording.losses)) == (offset != 0.0)
+    check(live, 0.01)
+
+
+def test_stamp_of_zero_is_the_receive_time() -> None:
+    live = LiveRecording(1e3)
+    for stamp, depth, velocity, force in SAMPLES:
+        live.take_force(0, force, stamp)
+        live.take_motion(stamp, depth, velocity, stamp)
+    recording = live.recording()
+    losses = f'{len(SAMPLES)} of base_wrench without a stamp, the receive time is used'
+    assert recording.losses == (losses,)
+    check(live, 0.01)
+
+
+@given(before=st.integers(0, 3))
+@settings(max_examples=4, deadline=None)
+def test_velocities_alone_are_integrated(before: int) -> None:
+    """A first depth after them: they count as not finite, as a missing depth in a bag."""
+    live = LiveRecording(1e3)
+    for stamp, _, velocity, force in SAMPLES:
+        live.take_force(stamp, force)
+        live.take_motion(stamp, nan, velocity)
+    recording = live.recording()
+    assert 'has no position' in '; '.join(recording.losses)
+    assert live.dropped == {}
+    # The integral of the sampled velocity: the rounded corners of the ramps.
+    expected = RECORDING.depth - RECORDING.depth[0]
+    assert np.abs(recording.depth - recording.depth[0] - expected).max() < 1e-5
+    check(live, 0.01)
+    mixed = LiveRecording(1e3)
+    for k, (stamp, depth, velocity, force) in enumerate(SAMPLES):
+        mixed.take_force(stamp, force)
+        mixed.take_motion(stamp, nan if k < before else depth, velocity)
+    assert mixed.dropped == ({'not finite': before} if before else {})
+    assert_array_equal(mixed.recording().depth, fed(SAMPLES[before:]).recording().depth)
+
+
 @pytest.mark.parametrize('step', [2, 10, 10_000])
 @given(at=st.integers(10, len(SAMPLES) - 10), forces=st.booleans())
 @settings(max_examples=10, deadline=None)

@@ -269,6 +269,35 @@ def test_running_topics_have_the_units_of_the_axes(ros_graph: RosGraph) -> None:
     assert_allclose(recording.force, 0.7, rtol=1e-12)
 
 
+@pytest.mark.parametrize('stamps', ['header', 'receive'])
+def test_receive_times_are_those_of_the_middleware(ros_graph: RosGraph, stamps: str) -> None:
+    """However late the node takes the messages; also for messages without a stamp."""
+    node = ros_graph.add(IdentificationNode, parameters={'live': True, 'time': stamps})
+    probe = ros_graph.node('probe')
+    joints = probe.create_publisher(JointState, 'joint_states', SENSOR)
+    wrenches = probe.create_publisher(WrenchStamped, 'base_wrench', SENSOR)
+    ros_graph.spin_until(
+        lambda: joints.get_subscription_count() and wrenches.get_subscription_count(), 'discovery'
+    )
+    sent = []
+    for k in range(4):
+        state, wrench = JointState(name=['insertion'], position=[0.01 * k]), WrenchStamped()
+        if stamps == 'receive':
+            # Stamps that are to be ignored.
+            state.header.stamp.sec, wrench.header.stamp.sec = 5 * k + 5, 7
+        sent.append(probe.get_clock().now().nanoseconds)
+        joints.publish(state)
+        wrenches.publish(wrench)
+        # Nothing spins meanwhile.
+        time.sleep(0.05)
+    ros_graph.spin_until(lambda: node.diagnose().status.samples == 4, 'the samples')
+    recording = node._live.recording()
+    # All are taken at once, within a millisecond.
+    assert recording.time[-1] > 0.5e-9 * (sent[-1] - sent[0])
+    stated = 'without a stamp, the receive time is used' in '; '.join(recording.losses)
+    assert stated == (stamps == 'header')
+
+
 def test_invalid_messages_are_counted_and_the_node_stays_active(ros_graph: RosGraph) -> None:
     """NaN, a clock set back, and joint states without the joint or without its position."""
     node = ros_graph.add(IdentificationNode, parameters={'live': True})
