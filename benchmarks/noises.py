@@ -233,6 +233,7 @@ LINES: Final[Mapping[str, NoiseRow]] = {
     'offset and its term': NoiseRow(kind=NoiseKind(truth={'offset': 0.2}), terms=('offset',)),
     'counts': NoiseRow(kind=NoiseKind(white=0.01, counts=0.02)),
     'positions only, counts': NoiseRow(kind=NoiseKind(positions_only=True)),
+    'positions only, 10 um': NoiseRow(kind=NoiseKind(positions_only=True, position_counts=1e-5)),
     'positions only, 1 um': NoiseRow(
         kind=NoiseKind(positions_only=True, position_noise=1e-6, position_counts=0.0)
     ),

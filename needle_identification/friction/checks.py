@@ -2,8 +2,8 @@
 """Plausibility checks of a friction estimate: errors and warnings."""
 
 from collections.abc import Iterator, Sequence
-from math import sqrt
-from typing import Final
+from math import inf, sqrt
+from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation.estimate import check_sign, ParameterEstimate
@@ -16,6 +16,7 @@ import numpy as np
 _UNUSUAL_LAG: Final = 0.01  # largest lag of usual sensor filters [s]
 _MUCH_LARGER: Final = 1.5  # growth of the errors by autocorrelated noise for a warning
 _MORE_THAN_NOISE: Final = 1.2  # mu_v times noise of the velocity over the residual
+_NOTABLE: Final = 0.5  # bias of mu_v by noise of the velocity that is corrected [standard errors]
 _DOUBT: Final = 1e-4  # p-value of the terms at reversals for a warning
 _WANDERS: Final = 0.25  # part of the recording: longer correlation is not finite
 _FRICTION: Final = ('coulomb_friction', 'viscous_friction')
@@ -131,24 +132,40 @@ def _of_lag(lag: ParameterEstimate, coarse: float, design: Design) -> Iterator[s
             yield f'the force is {size} ahead of the motion: clocks, or a mass (term inertia)'
 
 
-def noise_bias(design: Design, fit: Regression) -> float:
-    """Return the bias of mu_v by velocity noise [N s/m]; 0 if negligible or corrected."""
+class VelocityBias(NamedTuple):
+    """Bias of mu_v by white noise of the velocity, and its error [N s/m]; the noise as a force."""
+
+    bias: float
+    error: float
+    noise: float  # [N]
+
+
+def velocity_bias(design: Design, fit: Regression) -> VelocityBias:
+    """Return the bias of least squares; the error is inf if the data do not determine mu_v."""
     settings, noise = design.signals.settings, design.signals.velocity_noise
     columns = columns_of(settings.terms, settings)
     names = [column.name for column in columns]
-    if settings.estimator == 'total' or 'viscous_friction' not in names:
-        return 0.0
+    if 'viscous_friction' not in names:
+        return VelocityBias(0.0, 0.0, 0.0)
     k = names.index('viscous_friction')
     if not fit.determined[k]:
-        return 0.0
-    # The noise of the velocity is part of the residual. More was found where a slow sampling does
-    # not resolve the motion.
-    spread = np.linalg.norm(fit.residual) / sqrt(fit.samples)
-    if abs(fit.values[k]) * noise > _MORE_THAN_NOISE * spread:
-        return 0.0
+        return VelocityBias(0.0, inf, 0.0)
     x = design.regressors(settings.terms).take(design.rows, axis=0)[:, : len(columns)]
     bias = float(fit.values[k] * fit.samples * noise**2 * np.linalg.pinv(x.T @ x)[k, k])
-    return bias if bias > 0.5 * fit.errors[k] else 0.0
+    return VelocityBias(bias, float(fit.errors[k]), float(abs(fit.values[k])) * noise)
+
+
+def noise_bias(design: Design, fit: Regression) -> float:
+    """Return the bias of mu_v by velocity noise [N s/m]; 0 if negligible or corrected."""
+    if design.signals.settings.estimator == 'total':
+        return 0.0
+    found = velocity_bias(design, fit)
+    # The noise of the velocity is part of the residual. More was found where a slow sampling does
+    # not resolve the motion.
+    spread = float(np.linalg.norm(fit.residual)) / sqrt(fit.samples)
+    if found.noise > _MORE_THAN_NOISE * spread:
+        return 0.0
+    return found.bias if found.bias > _NOTABLE * found.error else 0.0
 
 
 def noise_words(design: Design, bias: float) -> str:

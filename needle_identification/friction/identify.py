@@ -11,7 +11,7 @@ with optional further terms:
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from math import nan, sqrt
+from math import hypot, isfinite, isinf, nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
@@ -42,6 +42,9 @@ import numpy as np
 
 _HIDDEN: Final = 0.2  # largest velocity noise threshold, as a fraction of the median speed
 _CLEANER: Final = 0.5  # velocity noise of positions that replace velocities, at most
+_HALVINGS: Final = 3  # most halvings of the cutoff
+_NEGLIGIBLE: Final = 0.25  # bias of mu_v at which the cutoff is low enough [standard errors]
+_DEARER: Final = 1.5  # largest error of mu_v by a halved cutoff over error and bias before
 _TRANSITION: Final = 0.1  # time of a possible deviation after a change [s]
 _BEGIN: Final = 0.01  # time after a change in which missing force is tested [s]
 _DEVIATES: Final = 3.5  # missing force that leaves these samples out [standard errors]
@@ -98,12 +101,18 @@ def identify_friction(
     automatic = settings.estimator == AUTO
     if automatic:
         settings = replace(settings, estimator='ordinary')
-        alternatives = (_from_positions, _with_low_pass, _with_total, _without_transitions)
+        alternatives = (
+            _from_positions,
+            _with_lower_cutoff,
+            _with_low_pass,
+            _with_total,
+            _without_transitions,
+        )
     remarks: tuple[str, ...] = ()
     try:
         signals = filter_signals(recording, settings)
         recording, signals, remarks = _compared(recording, signals, automatic)
-        chosen = _fitted(signals, *remarks)
+        chosen = _first(recording, signals, remarks, automatic)
         for alternative in alternatives:
             chosen = alternative(recording, chosen) or chosen
         return _finished(recording.name, chosen, among)
@@ -188,6 +197,61 @@ def _from_positions(recording: Recording, chosen: _Candidate) -> _Candidate | No
     if delay:
         remark = f'the speed is {1e3 * delay:.2g} ms behind the positions: a filter of the driver'
     return _fitted(positions, f'{remark}: took the speed from the positions')
+
+
+def _first(
+    recording: Recording, signals: FilteredSignals, remarks: tuple[str, ...], automatic: bool
+) -> _Candidate:
+    """Fit; if noise or counts of positions leave too little motion, at a lower cutoff."""
+    try:
+        return _fitted(signals, *remarks)
+    except IdentificationError:
+        if not automatic or not signals.from_positions:
+            raise
+        words, lower = 'noise or counts of the positions leave out most of the motion', signals
+        for _ in range(_HALVINGS):
+            with suppress(IdentificationError):
+                lower = _lowered(recording, lower)
+                return _fitted(lower, *remarks, f'{words}: {_cutoff_words(lower)}')
+        raise
+
+
+def _lowered(recording: Recording, signals: FilteredSignals) -> FilteredSignals:
+    """Filter the positions with half the cutoff."""
+    settings = replace(signals.settings, cutoff=0.5 * signals.settings.cutoff)
+    return filter_signals(replace(recording, velocity=None), settings)
+
+
+def _cutoff_words(signals: FilteredSignals) -> str:
+    return f'took a cutoff of {signals.settings.cutoff:g} Hz'
+
+
+def _with_lower_cutoff(recording: Recording, chosen: _Candidate) -> _Candidate | None:
+    """Halve the cutoff while noise of the positions hides motion or biases viscous friction."""
+    if not chosen.design.signals.from_positions:
+        return None
+    first = checks.velocity_bias(chosen.design, chosen.fit)
+    # The bias by the noise of a differentiated position grows with the third power of the cutoff.
+    found, now = chosen, first
+    for _ in range(_HALVINGS):
+        hidden = isinf(now.error) and not found.design.signals.is_clear
+        if not hidden and now.bias <= _NEGLIGIBLE * now.error:
+            break
+        try:
+            lower = _fitted(_lowered(recording, found.design.signals))
+        except IdentificationError:
+            break
+        then = checks.velocity_bias(lower.design, lower.fit)
+        if then.error > _DEARER * hypot(now.bias, now.error):
+            break
+        found, now = lower, then
+    if found is chosen or isinf(now.error):
+        return None
+    words = chosen.design.signals.noise_words
+    if isfinite(first.error):
+        words = checks.noise_words(chosen.design, first.bias)
+    remark = f'{words}: {_cutoff_words(found.design.signals)}'
+    return found._replace(remarks=(*chosen.remarks, remark))
 
 
 def _noise_remark(chosen: _Candidate) -> str:

@@ -386,14 +386,17 @@ def test_noise_of_the_positions_is_no_friction_near_rest(
 
 @pytest.mark.parametrize('noise', [2e-5, 4e-5])
 def test_a_lower_cutoff_is_the_remedy_for_motion_hidden_by_noise(noise: float) -> None:
+    """It is chosen automatically, and advised with a chosen estimator."""
     kind = NoiseKind(positions_only=True, position_noise=noise)
     for seed in range(4):
         recording, truth = recorded(kind, np.random.default_rng(seed))
         with pytest.raises(IdentificationError, match='choose a lower cutoff'):
-            identify_friction(recording)
-        found = identify_friction(recording, FrictionSettings(cutoff=5.0))
-        for name, value in truth.items():
-            assert abs(found[name].value - value) < 4.0 * found[name].error
+            identify_friction(recording, FrictionSettings(estimator='ordinary'))
+        chosen = identify_friction(recording)
+        assert any('took a cutoff of' in words for words in chosen.warnings)
+        for found in (chosen, identify_friction(recording, FrictionSettings(cutoff=5.0))):
+            for name, value in truth.items():
+                assert abs(found[name].value - value) < 4.0 * found[name].error
         # Noise without motion: another topic is the remedy.
         still = replace(recording, depth=noise * np.random.default_rng(seed).normal(size=10000))
         with pytest.raises(IdentificationError, match=r'axis, topic or column$'):
@@ -405,11 +408,12 @@ def test_a_lower_cutoff_is_the_remedy_for_coarse_counts() -> None:
     exact = strokes(seed=0, speeds=(0.02, 0.04, 0.06) * 3)
     recording = replace(exact, depth=1e-4 * np.round(1e4 * exact.depth), velocity=None)
     with pytest.raises(IdentificationError, match=r'not steady, .* choose a lower cutoff$'):
-        identify_friction(recording)
-    found = identify_friction(recording, FrictionSettings(cutoff=5.0))
-    # Equal strokes have equal errors of counting, which no interval states: at most one count in
-    # a stroke of 20 mm, averaged over 18 strokes.
-    assert found['viscous_friction'].value == pytest.approx(VISCOUS, rel=1e-3)
+        identify_friction(recording, FrictionSettings(estimator='ordinary'))
+    for cutoff in (30.0, 5.0):
+        found = identify_friction(recording, FrictionSettings(cutoff=cutoff))
+        # Equal strokes have equal errors of counting, which no interval states: at most one count
+        # in a stroke of 20 mm, averaged over 18 strokes.
+        assert found['viscous_friction'].value == pytest.approx(VISCOUS, rel=1e-3)
     finer = replace(recording, depth=1e-6 * np.round(1e6 * exact.depth))
     assert identify_friction(finer)['viscous_friction'].determined
 
