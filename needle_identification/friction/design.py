@@ -160,10 +160,15 @@ class Design:
 
     def lag_spread(self) -> Trial:
         """Return the variance [s^2] of the lag that the fit lacks."""
-        time, used = self.signals.time, self.used
-        bend = self.signals.motion(np.clip(time - self.lag, time[0], time[-1]), 2)[used]
-        bend *= np.linalg.norm(self.lag_column[used]) / np.linalg.norm(self.acceleration[used])
-        return self.screening.tried(0.5 * bend[:, np.newaxis])
+        signals, time, used = self.signals, self.signals.time, self.used
+        slope = np.linalg.norm(self.lag_column[used]) / np.linalg.norm(self.acceleration[used])
+        bend = signals.motion(np.clip(time - self.lag, time[0], time[-1]), 2)[used, np.newaxis]
+        shared = None
+        if signals.velocity_noise:
+            # The noise e of the velocity and its second derivative: E[e e''] = -E[e'^2].
+            per_noise = -(signals.acceleration_noise**2) / signals.velocity_noise
+            shared = np.full_like(bend, 0.5 * slope * per_noise)
+        return self.screening.tried(0.5 * slope * bend, shared)
 
     def with_lag_column(self) -> Design:
         """Add the derivative of the fitted force by the lag as a regressor."""

@@ -11,7 +11,7 @@ with optional further terms:
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from math import hypot, isfinite, isinf, nan, sqrt
+from math import hypot, isinf, nan, sqrt
 from typing import Final, NamedTuple
 
 from needle_identification.errors import IdentificationError
@@ -227,16 +227,14 @@ def _cutoff_words(signals: FilteredSignals) -> str:
 
 
 def _with_lower_cutoff(recording: Recording, chosen: _Candidate) -> _Candidate | None:
-    """Halve the cutoff while noise of the positions hides motion or biases viscous friction."""
+    """Halve the cutoff while noise of the positions hides motion or lag, or biases mu_v."""
     if not chosen.design.signals.from_positions:
         return None
-    first = checks.velocity_bias(chosen.design, chosen.fit)
-    # The bias by the noise of a differentiated position grows with the third power of the cutoff.
-    found, now = chosen, first
+    found, words = chosen, _harm(chosen)
     for _ in range(_HALVINGS):
-        hidden = isinf(now.error) and not found.design.signals.is_clear
-        if not hidden and now.bias <= _NEGLIGIBLE * now.error:
+        if not _harm(found):
             break
+        now = checks.velocity_bias(found.design, found.fit)
         try:
             lower = _fitted(_lowered(recording, found.design.signals))
         except IdentificationError:
@@ -244,14 +242,25 @@ def _with_lower_cutoff(recording: Recording, chosen: _Candidate) -> _Candidate |
         then = checks.velocity_bias(lower.design, lower.fit)
         if then.error > _DEARER * hypot(now.bias, now.error):
             break
-        found, now = lower, then
-    if found is chosen or isinf(now.error):
+        found = lower
+    if found is chosen or isinf(checks.velocity_bias(found.design, found.fit).error):
         return None
-    words = chosen.design.signals.noise_words
-    if isfinite(first.error):
-        words = checks.noise_words(chosen.design, first.bias)
     remark = f'{words}: {_cutoff_words(found.design.signals)}'
     return found._replace(remarks=(*chosen.remarks, remark))
+
+
+def _harm(chosen: _Candidate) -> str:
+    """Return words about the effect of the noise of positions, or an empty string."""
+    design, signals = chosen.design, chosen.design.signals
+    found = checks.velocity_bias(design, chosen.fit)
+    # It grows with the third power of the cutoff.
+    if found.bias > _NEGLIGIBLE * found.error:
+        return checks.noise_words(design, found.bias)
+    if isinf(found.error) and not signals.is_clear:
+        return signals.noise_words
+    if chosen.coarse and not design.estimates_lag:
+        return f'noise of {signals.velocity_noise:.2g} m/s in the speed hides the lag of the force'
+    return ''
 
 
 def _noise_remark(chosen: _Candidate) -> str:

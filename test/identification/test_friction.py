@@ -397,6 +397,29 @@ def test_counts_of_the_positions_do_not_bias_the_friction(counts: float, rate: f
     assert np.sum(np.square(scores)) < 2.0 * chi2.isf(1e-5, 8)
 
 
+@pytest.mark.parametrize('counts', [1e-6, 5e-6])
+@pytest.mark.parametrize('delay', [0.018, 0.04])
+def test_delay_of_the_force_to_counted_positions_is_no_filter(counts: float, delay: float) -> None:
+    """At a lower cutoff the lag is known; the noise of the speed is no variance of the lag."""
+    kind = NoiseKind(
+        positions_only=True,
+        position_counts=counts,
+        plant=lambda made, _truth, _rng: made._replace(
+            force=np.interp(made.time - delay, made.time, made.force)
+        ),
+    )
+    for seed in range(6):
+        recording, truth = recorded(kind, np.random.default_rng([5, seed]))
+        found = identify_friction(recording)
+        said = '; '.join(found.warnings)
+        assert 'low-pass' not in said
+        stated = re.search(r'the force is ([\d.]+) ± [\d.]+ ms behind', said)
+        # 1 ms is a quarter of a sample; the coarse lag, in steps of half the filter, is 6 ms off.
+        assert stated is None or float(stated[1]) == pytest.approx(1e3 * delay, abs=1.0)
+        assert counts > 1e-6 or stated
+        assert all(within(found[name], truth[name], 4.5) for name in TRUTH)
+
+
 @hypothesis.given(
     step=st.floats(1e-7, 1e-3),
     begin=st.floats(-0.2, 0.2),
