@@ -429,6 +429,10 @@ def _suggestion(
     if sense < 0.0:
         words.append('the force is opposite to the motion: sign reversed')
         axis = f'-{axis}'
+    strength = float(np.ptp(force.values))
+    if strength > reading.STRONGEST:
+        words.append(f'it varies by {strength:.4g} N if it is in N: mN assumed')
+        axis = f'{axis}[mN]'
     if axis != 'y':
         options += ['--force-axis', axis]
     usual = INSERTION if motion.topic.type_name == wire.JOINT_STATE else 'y'

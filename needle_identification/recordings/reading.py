@@ -49,6 +49,7 @@ _POSES: Final = (wire.POSE, wire.POINT, wire.ODOMETRY, wire.JOINT_STATE)
 _USUAL: Final = (END_EFFECTOR_POSE.name, JOINT_STATES.name)
 #: Spans of positions of an insertion, and under the force of presses, that are rarely in m.
 LONGEST_STROKE, _DEEPEST_PRESS = 2.0, 0.25
+STRONGEST: Final = 500.0  #: span of forces on a needle that are rarely in N
 _FRICTION_MOTION: Final = Wanted('motion_topic', MOTIONS, _USUAL[::-1])
 _INDENTATION_MOTION: Final = Wanted('motion_topic', _POSES, _USUAL)
 
@@ -148,6 +149,8 @@ def read_friction_recording(
     moved = moved._replace(values=direction * length * moved.values)
     if length == 1.0:
         bag.losses += _too_long(motion, moved.values[:, 0], LONGEST_STROKE, '--motion-axis', name)
+    if size == 1.0:
+        bag.losses += _too_strong(wrench, force.values[:, 0], force_axis)
     return merged_recording(
         bag, force._replace(values=sign * size * force.values), moved, configuration
     )
@@ -267,11 +270,21 @@ def _too_long(
     topic: BagTopic, positions: FloatArray, longest: float, option: str, axis: str
 ) -> list[str]:
     """Warn of positions whose span is rarely one in m."""
-    known = positions[np.isfinite(positions)]
-    span = float(np.ptp(known)) if len(known) else 0.0
-    if span <= longest:
+    if (span := _span(positions)) <= longest:
         return []
     return [f'{topic.name} moves over {span:.3g} m along {axis}: perhaps {option} {axis}[mm]']
+
+
+def _too_strong(topic: BagTopic, forces: FloatArray, axis: str) -> list[str]:
+    """Warn of forces on a needle whose span is rarely one in N."""
+    if (span := _span(forces)) <= STRONGEST:
+        return []
+    return [f'{topic.name} varies by {span:.4g} N along {axis}: perhaps --force-axis {axis}[mN]']
+
+
+def _span(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.ptp(known)) if len(known) else 0.0
 
 
 def _motion_source(

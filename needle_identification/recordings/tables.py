@@ -40,7 +40,6 @@ from needle_ros.quantities import signed
 import numpy as np
 
 ROLES: Final = ('time', 'depth', 'speed', 'force')  #: for friction; depth or speed is sufficient
-
 #: Usual names of a column of time.
 TIME_NAMES: Final = ('time', 't', 'timestamp', 'stamp', 'elapsed', 'seconds', 'sec')
 
@@ -65,6 +64,7 @@ _SUSPICIOUS: Final = {
     'time': (('ms', 0.99), ('us', 990.0), ('ns', 9.9e5)),
     'depth': (('mm', 2.0),),
     'speed': (('mm/s', 2.0),),
+    'force': (('mN', 500.0),),
     **dict.fromkeys(('guide_x', 'guide_z'), (('mm', 0.1),)),
 }
 _SECONDS: Final = ('sec', 'seconds')  #: Names of times that are in s.

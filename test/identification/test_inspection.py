@@ -233,6 +233,20 @@ def test_a_motion_in_mm_of_a_bag_is_named(
     assert 'm along y: perhaps --motion-axis y[mm]' in capsys.readouterr().err
 
 
+def test_a_force_in_mn_of_a_bag_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The suggested command has the unit, and gives the friction in N."""
+    found = inspect_recording(posed(tmp_path / 'bag', force=(0.0, 1e3, 0.0)))
+    assert found.command.endswith("--force-axis 'y[mN]'")
+    assert run(found.command) == 0
+    assert 'perhaps' not in capsys.readouterr().err
+    in_mn = read_friction_recording(tmp_path / 'bag', force_axis='y[mN]')
+    assert_allclose(in_mn.force, read_friction_recording(posed(tmp_path / 'other')).force)
+    assert main(['identify', 'friction', str(tmp_path / 'bag')]) == 0
+    assert 'N along y: perhaps --force-axis y[mN]' in capsys.readouterr().err
+
+
 def test_a_tilted_force_sensor_is_named(tmp_path: Path) -> None:
     found = inspect_recording(posed(tmp_path / 'bag', force=(0.0, 0.8, 0.6)))
     said = 'z is 0.75 of y: a sensor that is tilted measures along y only a part of the force'

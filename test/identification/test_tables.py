@@ -200,6 +200,10 @@ def test_probable_units_and_forces_are_found(run: tuple[Any, Any, Any], tmp_path
     for hint in ('perhaps time=time[ms]', 'perhaps depth=depth[mm]'):
         assert any(hint in line for line in read.losses), read.losses
     assert 'time=time[ms],depth=depth[mm],force=Push [N]' in inspect_recording(path).command
+    rows[:, 2] *= 1e3
+    np.savetxt(path, rows, delimiter=',', header='time,depth,force', comments='')
+    hint = 'perhaps force=force[mN]'
+    assert any(hint in line for line in read_friction_recording(path).losses)
 
 
 def test_velocities_without_depth_are_integrated(tmp_path: Path) -> None:
