@@ -10,11 +10,12 @@ near a start, a stop or a reversal are left out later; see `design`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, inf, sqrt
+from math import ceil, sqrt
 from typing import Final, TYPE_CHECKING
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
+from needle_identification.estimation.rounding import resolution
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.recordings.recording import Recording
 import numpy as np
@@ -34,9 +35,6 @@ _HIDES: Final = 10.0  # largest one that is hidden by noise, likewise
 _KEPT: Final = 8.0  # samples per period of the cutoff that are kept after the filter
 _LONGER: Final = 3  # hold time at a limit of the sensor over the longest at other values
 _MOST_CUT_OFF: Final = 0.5  # largest fraction of samples that may count as saturated
-_EQUAL: Final = 1e-12  # relative difference of equal values, by rounding
-_MULTIPLE: Final = 0.02  # largest deviation from a multiple of the resolution
-_MOSTLY: Final = 0.9  # smallest fraction of multiples
 _FEWEST: Final = 6  # samples of a spline of order 5
 _LARGEST_GRID: Final = 10.0  # resampled points per sample; more are mostly gaps
 
@@ -175,15 +173,6 @@ def cut_off(force: FloatArray) -> BoolArray:
             found |= force == limit
     # A nearly constant force is also constant at its extreme values.
     return found if found.mean() < _MOST_CUT_OFF else np.zeros_like(found)
-
-
-def resolution(values: FloatArray) -> float:
-    """Return the step of which nearly all differences of the values are multiples, or 0."""
-    steps = np.diff(np.unique(values))
-    steps = steps[steps > _EQUAL * np.abs(values).max(initial=0.0)]
-    least = float(steps.min(initial=inf))
-    multiple = np.abs(steps / least - np.rint(steps / least)) < _MULTIPLE
-    return least if len(steps) and np.mean(multiple) > _MOSTLY else 0.0
 
 
 def filter_taps(cutoff: float, period: float) -> FloatArray:

@@ -162,12 +162,16 @@ def _compared(
     unit, own = _unit_of('speed', 1.0 / ratio), _unit_of('depth', ratio)
     words = f'the speed is {ratio:.4g} ± {error:.2g} times the change of the positions'
     words += f' (speed in {unit}?)' if unit else f' (depth in {own}?)' if own else ''
+    alone = replace(recording, velocity=None)
     if ratio < 0.0:
-        # The sign of the velocity is that of the friction, otherwise friction is negative.
-        return recording, signals, (f'{words}: depth or velocity has the wrong sign',)
+        words += ': depth or velocity has the wrong sign'
+        # Friction dissipates: the power of the force is positive.
+        if not automatic or recording.force @ recording.velocity >= 0.0:
+            return recording, signals, (words,)
+        positions = filter_signals(alone, signals.settings)
+        return alone, positions, (f'{words}: took the speed from the positions',)
     if own or not automatic:
         return recording, signals, (words,)
-    alone = replace(recording, velocity=None)
     positions = filter_signals(alone, signals.settings)
     apart = abs(1.0 - 1.0 / ratio) * float(np.std(recording.velocity))
     if positions.velocity_noise > _CLEANER * apart:

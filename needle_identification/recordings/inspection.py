@@ -421,18 +421,11 @@ def _suggestion(
     ):
         if len([topic for topic in components if topic.type_name in types]) > 1:
             options += [option, one.topic.name]
-    axis, direction, scale = force.axis, 1.0, 1.0
+    direction, scale = 1.0, 1.0
     if motion.axis == robot.get('hardware.joint') and motion.topic.type_name == wire.JOINT_STATE:
         direction, scale = robot['hardware.sign'], robot['hardware.scale']
-    sense *= direction
-    words += [_UNSIGNED] * (not sense)
-    if sense < 0.0:
-        words.append('the force is opposite to the motion: sign reversed')
-        axis = f'-{axis}'
-    strength = float(np.ptp(force.values))
-    if strength > reading.STRONGEST:
-        words.append(f'it varies by {strength:.4g} N if it is in N: mN assumed')
-        axis = f'{axis}[mN]'
+    axis, more = _force_axis(force, sense * direction)
+    words += more
     if axis != 'y':
         options += ['--force-axis', axis]
     usual = INSERTION if motion.topic.type_name == wire.JOINT_STATE else 'y'
@@ -447,6 +440,19 @@ def _suggestion(
         options += ['--motion-axis', motion.axis]
     command = shlex.join(['needle', 'identify', 'friction', str(path), *options])
     return words, command
+
+
+def _force_axis(force: _Signal, sense: float) -> tuple[str, list[str]]:
+    """Return the axis of the force with the sign of its sense and its unit, and their reasons."""
+    axis, words = force.axis, [_UNSIGNED] * (not sense)
+    if sense < 0.0:
+        words.append('the force is opposite to the motion: sign reversed')
+        axis = f'-{axis}'
+    strength = float(np.ptp(force.values))
+    if strength > reading.STRONGEST:
+        words.append(f'it varies by {strength:.4g} N if it is in N: mN assumed')
+        axis = f'{axis}[mN]'
+    return axis, words
 
 
 def _across(chosen: _Signal, signals: Sequence[_Signal]) -> dict[str, FloatArray]:

@@ -93,12 +93,12 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
     columns = np.flatnonzero(norm(displacement, axis=0) > _LARGEST_NOISE * error)
     singular = np.linalg.svd(displacement[:, columns], compute_uv=False)
     if not len(columns) or singular[-1] < _SMALLEST_SPREAD * error:
-        condition = float(singular[0] / singular[-1]) if len(columns) else inf
+        condition = float(singular[0] / singular[-1]) if singular[-1:].any() else inf
         return MatrixFit(condition=condition)
     displacement = displacement[:, columns]
     start = np.zeros((2, 2))
     start[:, columns] = np.linalg.lstsq(displacement, force, rcond=None)[0].T
-    covariances = noise.covariance(start, chosen, pooled=estimator != 'weighted')
+    covariances, rounding = noise.covariance(start, chosen, pooled=estimator != 'weighted')
     matrix, factors = np.full((2, 2), nan), np.zeros((2, 2, 2))
     known = np.isin(np.arange(2), columns)
     residual = np.empty_like(force)
@@ -113,6 +113,8 @@ def fit_matrix(presses: Presses, noise: PressNoise, chosen: IntArray, estimator:
         x, y = (solve_triangular(root, a, lower=True) for a in (displacement, force[:, row]))
         fit = regress(x, y, estimator=kind, regressor_noise=spread)
         deviation, freedoms[row], left = _deviation(fit.residual, freedom, estimator)
+        # Equal presses do not scatter by their error of rounding.
+        deviation = max(deviation, sqrt(float(rounding[row]) * size))
         matrix[row, columns] = fit.values
         known[columns] &= fit.determined
         residual[:, row] = root @ fit.residual

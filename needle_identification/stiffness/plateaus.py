@@ -8,12 +8,13 @@ force are rests, the others are holds.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import ceil, hypot, inf, sqrt
+from math import ceil, hypot, inf, pi, sqrt
 from typing import Final, NamedTuple
 
 from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.estimation import ESTIMATORS
+from needle_identification.estimation.rounding import resolution
 from needle_identification.recordings.recording import IndentationRecording
 from needle_ros.settings import CheckedSettings, choice, constant, positive
 import numpy as np
@@ -62,6 +63,7 @@ class Plateaus(NamedTuple):
     mean: FloatArray  # (p, 5)
     variance: FloatArray  # (p, 5) of the means
     trend: FloatArray  # (p, 5) change of a fitted line from the first to the last sample
+    rounding: FloatArray  # (5,) variance of a mean by the resolution of its channel
     rest: BoolArray  # (p,) whether it is a rest
     missed: int  # presses without a plateau
 
@@ -107,7 +109,19 @@ def find_plateaus(recording: IndentationRecording, settings: StiffnessSettings) 
     high = size > max(2.0 * settings.rest_force, 0.5 * _BAND * noise)
     missed = sum(high[up:down].any() and not in_hold[up:down].any() for up, down in edges)
     trend = np.array([_line(channels[begin:end]) for begin, end in parts])
-    return Plateaus(middle, mean, _variances(channels, parts), trend, rest, missed)
+    rounding = _rounding(channels, parts)
+    return Plateaus(middle, mean, _variances(channels, parts), trend, rounding, rest, missed)
+
+
+def _rounding(channels: FloatArray, parts: list[tuple[int, int]]) -> FloatArray:
+    """Return the variance (c,) of means of rounded values, which noise reduces."""
+    steps = np.array([resolution(values) for values in channels.T])
+    uniform = steps**2 / 12.0
+    measured = np.mean([channels[begin:end].var(axis=0) for begin, end in parts], axis=0)
+    # The first harmonic of the error of rounding in normal noise (B. Widrow, I. Kollar, M.-C. Liu,
+    # "Statistical theory of quantization", IEEE Trans. Instrum. Meas. 45(2), 1996).
+    noise = np.maximum(measured - uniform, 0.0) / np.where(steps > 0.0, steps, 1.0) ** 2
+    return np.asarray(uniform * np.exp(-((2.0 * pi) ** 2) * noise))
 
 
 def _steady_runs(

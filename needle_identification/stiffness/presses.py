@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from math import exp, hypot, log, pi, sqrt
 from typing import Final, NamedTuple
 
-from needle_dynamics.arrays import FloatArray, IntArray
+from needle_dynamics.arrays import BoolArray, FloatArray, IntArray
 from needle_identification.errors import IdentificationError
 from needle_identification.recordings.recording import IndentationRecording
 from needle_identification.stiffness.plateaus import Plateaus, StiffnessSettings
@@ -45,6 +45,8 @@ class PressNoise(NamedTuple):
     displacement: FloatArray  # likewise [m^2]
     force_zero: FloatArray  # (m, m) covariance of the zeros of an axis [N^2]
     displacement_zero: FloatArray  # likewise [m^2]
+    force_rounding: FloatArray  # (2, m, m) covariance by the resolution of each axis [N^2]
+    displacement_rounding: FloatArray  # likewise [m^2]
     creep: float  # growth of a displacement during its hold, as a fraction
     set: float  # fraction of a displacement that remains at the next rest
 
@@ -53,8 +55,14 @@ class PressNoise(NamedTuple):
         """Relative standard error of all stiffnesses by creep and by hysteresis."""
         return hypot(self.creep, self.set)
 
-    def covariance(self, matrix: FloatArray, chosen: IntArray, *, pooled: bool) -> FloatArray:
-        """Return the covariance (2, m, m) of F - K d by row of K [N^2], or of pooled noise."""
+    def covariance(
+        self, matrix: FloatArray, chosen: IntArray, *, pooled: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        """
+        Return the covariance (2, m, m) of F - K d by row of K [N^2], or of pooled noise.
+
+        Also return the share (2,) of rounding in it.
+        """
         force, displacement = self.force[chosen], self.displacement[chosen]
         squares: FloatArray = matrix**2
         if pooled:
@@ -67,13 +75,16 @@ class PressNoise(NamedTuple):
                 np.maximum(a, 0.1 * a.mean(axis=0)) for a in (force, displacement)
             )
         among = np.ix_(chosen, chosen)
-        rows = [
-            np.diag(force[:, row] + displacement @ squares[row])
-            + self.force_zero[among]
-            + squares[row].sum() * self.displacement_zero[among]
-            for row in range(2)
-        ]
-        return np.array(rows)
+        rows, shares = [], []
+        for row in range(2):
+            noise = np.diag(force[:, row] + displacement @ squares[row])
+            noise += self.force_zero[among] + squares[row].sum() * self.displacement_zero[among]
+            rounding = self.force_rounding[row] + np.tensordot(
+                squares[row], self.displacement_rounding, 1
+            )
+            rows.append(noise + rounding[among])
+            shares.append(np.trace(rounding[among]) / np.trace(rows[-1]))
+        return np.array(rows), np.array(shares)
 
 
 def find_presses(
@@ -98,8 +109,23 @@ def find_presses(
     force, displacement = change[:, :2], change[:, 2:4]
     variance, creep = plateaus.variance[hold], _fraction(plateaus.trend[hold, 2:4], displacement)
     left = _remaining(plateaus, displacement)
+    level, direction = grouped(np.hypot(*force.T), settings.level_tolerance), _directions(force)
+    alike = (direction[:, np.newaxis] == direction) & (level[:, np.newaxis] == level)
+    rounding = np.array(
+        [
+            _of_rounding(size, values, alike)
+            for size, values in zip(plateaus.rounding, plateaus.mean[hold].T, strict=True)
+        ]
+    )
     noise = PressNoise(
-        variance[:, :2], variance[:, 2:4], covariances[0], covariances[1], creep, left
+        force=variance[:, :2],
+        displacement=variance[:, 2:4],
+        force_zero=covariances[0],
+        displacement_zero=covariances[1],
+        force_rounding=rounding[:2],
+        displacement_rounding=rounding[2:4],
+        creep=creep,
+        set=left,
     )
     presses = Presses(
         time=time,
@@ -108,12 +134,21 @@ def find_presses(
         displacement_error=np.sqrt(noise.displacement + np.diag(covariances[1])[:, np.newaxis]),
         force_error=np.sqrt(noise.force + np.diag(covariances[0])[:, np.newaxis]),
         off_plane=change[:, 4],
-        level=grouped(np.hypot(*force.T), settings.level_tolerance),
-        direction=_directions(force),
+        level=level,
+        direction=direction,
     )
     for array in (getattr(presses, name) for name in Presses.__slots__):
         array.setflags(write=False)
     return presses, noise, _warnings(presses, noise, plateaus, settings)
+
+
+def _of_rounding(variance: float, values: FloatArray, alike: BoolArray) -> FloatArray:
+    """Return the covariance (m, m) of values relative to the rest, each rounded to a step."""
+    if variance == 0.0:
+        return np.zeros(alike.shape)
+    # Repetitions of a press have the same error; all presses have that of the rest in common.
+    steps = np.rint(values / sqrt(12.0 * variance))
+    return np.asarray(variance * (1.0 + (alike & (steps[:, np.newaxis] == steps))))
 
 
 def _fraction(change: FloatArray, displacement: FloatArray) -> float:

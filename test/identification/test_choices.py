@@ -277,6 +277,12 @@ def test_positions_against_the_velocity_are_named() -> None:
         assert words.endswith('depth or velocity has the wrong sign')
         for name, value in truth.items():
             assert abs(found[name].value - value) < 4.0 * found[name].error
+        # Friction dissipates: if the force is against the velocity, it is with the positions.
+        assert recording.velocity is not None
+        found = identify_friction(replace(recording, velocity=-recording.velocity))
+        assert any('wrong sign: took the speed from the' in words for words in found.warnings)
+        for name, value in truth.items():
+            assert abs(found[name].value - value) < 4.0 * found[name].error
 
 
 def holding(found: FrictionEstimate, truth: Mapping[str, float]) -> int:

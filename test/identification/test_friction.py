@@ -21,7 +21,8 @@ from needle_identification import (
     Recording,
     summarize,
 )
-from needle_identification.friction.filtering import _smooth, filter_taps, resolution
+from needle_identification.estimation.rounding import resolution
+from needle_identification.friction.filtering import _smooth, filter_taps
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 import pytest
