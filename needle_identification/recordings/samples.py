@@ -2,7 +2,7 @@
 """Gather the samples of one topic while its bag is read, by time and in bounded memory."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence, Set
+from collections.abc import Iterator, Sequence, Set
 from itertools import pairwise
 from math import inf
 from typing import Final, NamedTuple, NoReturn, Protocol
@@ -378,10 +378,17 @@ class Gathering:
         if len(series.stamps) < 2:
             fault = f'must have >= 2 samples at different times, has {len(series.stamps)}'
             self._reject(bag, fault)
-        if first := restart_of(np.concatenate(self._received)):
+        received = np.concatenate(self._received)
+        if first := restart_of(received):
             place = f'message {first * self._every + 1} of {self._messages}'
             remedy = 'use --time receive, or split the bag' if self._by_header else 'split the bag'
             self._reject(bag, f'time restarts at {place}: {remedy}')
+        remedy = '; time receive would correct it' if self._by_header else ''
+        bag.losses += [
+            f'the clock of {name} was set back by {1e-9 * (received[k - 1] - received[k]):.3g} s: '
+            f'for this time the samples from before and after are mixed{remedy}'
+            for k in _steps_back(received)
+        ]
         bag.losses += series.losses(name)
         bag.losses += [f'{name} {loss}' for loss in self._source.losses()]
         return Samples(name, series.stamps, series.values, np.concatenate(self._latencies))
@@ -406,20 +413,23 @@ def are_covered(stamps: IntArray | FloatArray, others: IntArray | FloatArray) ->
 
 def restart_of(time: IntArray | FloatArray, least: int = RUN) -> int:
     """Return the first sample of a second run, whose time begins again, else 0."""
+    latest = time.min() + _NEAR * np.ptp(time) if len(time) else 0
+    return next((begin for begin in _steps_back(time, least) if time[begin] <= latest), 0)
+
+
+def _steps_back(time: IntArray | FloatArray, least: int = RUN) -> Iterator[int]:
+    """Yield the first samples of parts whose times lie between those before."""
     steps = np.diff(time)
     back = np.flatnonzero(are_gaps(np.abs(steps)) & (steps < 0)) + 1
     # Samples in any order are sorted.
     if len(back) > len(time) // least:
-        return 0
-    latest = time.min() + _NEAR * np.ptp(time)
+        return
     for begin, end in pairwise([*back, len(time)]):
         run, before = time[begin:end], np.unique(time[:begin]).astype(np.float64)
         # Neither a part that was stored in another place or came late, nor single wrong times.
-        if run[0] > latest or len(before) < _OVERLAP:
-            continue
-        if np.count_nonzero(are_covered(run, before)) >= _OVERLAP:
-            return int(begin)
-    return 0
+        enough = len(before) >= _OVERLAP
+        if enough and np.count_nonzero(are_covered(run, before)) >= _OVERLAP:
+            yield int(begin)
 
 
 def position_and_velocity(samples: Samples, bag: SampleOrigin) -> Samples:

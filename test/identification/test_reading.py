@@ -561,6 +561,19 @@ def test_stamps_that_restart_are_named(
     assert_array_equal(read_friction_recording(path, time='receive').force, np.arange(800.0))
 
 
+@pytest.mark.parametrize('back', [205, 1505])
+def test_a_clock_that_was_set_back_is_named(tmp_path: Path, back: int) -> None:
+    """In the middle of a recording, by a number of ms; the receive times are in order."""
+    path = two_runs(tmp_path / 'bag', 4000 - back)
+    losses = '; '.join(read_friction_recording(path).losses)
+    for topic in ('/ft', '/joints'):
+        assert f'the clock of {topic} was set back by {1e-3 * (back - 10):.3g} s' in losses
+    assert 'time receive would correct it' in losses
+    received = read_friction_recording(path, time='receive')
+    assert not any('set back' in loss for loss in received.losses)
+    assert_array_equal(received.force, np.arange(800.0))
+
+
 @given(
     begin=strategies.integers(0, 300),
     late=strategies.integers(11, 100),
