@@ -15,7 +15,7 @@ from typing import Final, TYPE_CHECKING
 
 from needle_dynamics.arrays import BoolArray, FloatArray
 from needle_identification.errors import IdentificationError
-from needle_identification.estimation.rounding import resolution
+from needle_identification.estimation.rounding import rounding_of_motion
 from needle_identification.friction.settings import FrictionSettings
 from needle_identification.recordings.recording import Recording
 import numpy as np
@@ -134,9 +134,8 @@ def filter_signals(
     response = _filtered_velocity(around, impulse, of_motion, 1, from_positions)
     velocity, acceleration = motion(grid), motion(grid, 1)
     noise, sign = _white_noise(raw, velocity, acceleration), np.sign(velocity)
-    if from_positions:
-        # Strokes at a whole number of counts per sample show no noise.
-        noise = max(noise, resolution(measured) / sqrt(12.0))
+    # Strokes at a whole number of counts per sample show no noise.
+    rounding = rounding_of_motion(measured) if from_positions else 0.0
     return FilteredSignals(
         settings=settings,
         time=grid[::step],
@@ -149,7 +148,7 @@ def filter_signals(
         lost=np.asarray(maximum_filter1d(lost.astype(np.uint8), step)[::step] > 0),
         half_filter=ceil(half / step),
         margin=max(1, ceil(2 * (half - 1) / step)),
-        velocity_noise=noise * float(np.linalg.norm(response(around))),
+        velocity_noise=max(noise, rounding) * float(np.linalg.norm(response(around))),
         acceleration_noise=noise * float(np.linalg.norm(response(around, 1))),
         from_positions=from_positions,
         cut_off=float(cut.mean()),

@@ -44,7 +44,7 @@ _HIDDEN: Final = 0.2  # largest velocity noise threshold, as a fraction of the m
 _CLEANER: Final = 0.5  # velocity noise of positions that replace velocities, at most
 _HALVINGS: Final = 3  # most halvings of the cutoff
 _NEGLIGIBLE: Final = 0.25  # bias of mu_v at which the cutoff is low enough [standard errors]
-_DEARER: Final = 1.5  # largest error of mu_v by a halved cutoff over error and bias before
+_DEARER: Final = 1.5  # largest growth of the error of mu_v for a lag or motion that noise hides
 _TRANSITION: Final = 0.1  # time of a possible deviation after a change [s]
 _BEGIN: Final = 0.01  # time after a change in which missing force is tested [s]
 _DEVIATES: Final = 3.5  # missing force that leaves these samples out [standard errors]
@@ -244,7 +244,8 @@ def _with_lower_cutoff(recording: Recording, chosen: _Candidate) -> _Candidate |
         except IdentificationError:
             break
         then = checks.velocity_bias(lower.design, lower.fit)
-        if then.error > _DEARER * hypot(now.bias, now.error):
+        grows = 1.0 if now.bias > _NEGLIGIBLE * now.error else _DEARER
+        if hypot(then.bias, then.error) > grows * hypot(now.bias, now.error):
             break
         found = lower
     if found is chosen or isinf(checks.velocity_bias(found.design, found.fit).error):

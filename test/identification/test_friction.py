@@ -21,7 +21,7 @@ from needle_identification import (
     Recording,
     summarize,
 )
-from needle_identification.estimation.rounding import resolution
+from needle_identification.estimation.rounding import resolution, rounding_of_motion
 from needle_identification.friction.filtering import _smooth, filter_taps
 import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
@@ -435,6 +435,16 @@ def test_resolution_is_the_step_of_counts(step: float, begin: float, seed: int, 
     assert resolution(measured_counts) == pytest.approx(step, rel=1e-6)
     assert resolution(np.random.default_rng(seed).normal(begin, step, size)) == 0.0
     assert resolution(np.full(size, begin)) == 0.0
+
+
+def test_exact_positions_at_constant_speeds_are_not_rounded() -> None:
+    """They are multiples of a step as well; the same positions in counts are."""
+    velocity = np.repeat([0.0, 5e-3, -5e-3, 0.0, 1e-2, -1e-2] * 5, 500)
+    exact = np.asarray(0.1 + np.cumsum(velocity) / 250.0)
+    assert resolution(exact) == pytest.approx(2e-5)
+    assert rounding_of_motion(exact) == 0.0
+    counted = 7e-6 * np.round(exact / 7e-6)
+    assert rounding_of_motion(counted) == pytest.approx(7e-6 / np.sqrt(12.0))
 
 
 @pytest.mark.parametrize('seed', range(8))
