@@ -230,7 +230,11 @@ class BaseNode(ParameterNode):
         The receive time is that of the middleware, however late the message is taken.
         """
         kind, taken = message_class(topic.type_name), self._parsed(topic, take)
-        subscription = self.create_subscription(kind, topic.name, _nothing, qos, raw=True)
+        # Events of a subscription that is destroyed in a callback would end the executor.
+        events = SubscriptionEventCallbacks(use_default_callbacks=False)
+        subscription = self.create_subscription(
+            kind, topic.name, _nothing, qos, raw=True, event_callbacks=events
+        )
         self.take_over(subscription)
 
         def take_all() -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files and documents: atomic writing, and safe reading of YAML from external files."""
 
+from collections import Counter
 from contextlib import suppress
 import os
 from pathlib import Path
@@ -12,6 +13,8 @@ import yaml
 
 LARGEST: Final = 2**20  #: Maximum document length [characters].
 _DEEPEST: Final = 32  #: Maximum nesting depth.
+_LONGEST_NUMBER: Final = 1000  #: Maximum length of a number, whose time is quadratic [characters].
+_NUMBER: Final = re.compile(r'[-+]?[0-9][0-9a-fA-FxX_:.]*', re.ASCII)
 
 
 def write_whole(path: Path | str, content: bytes) -> None:
@@ -37,8 +40,8 @@ class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[mi
         found: dict[Any, Any] = super().construct_mapping(node, deep=deep)
         if len(found) < len(node.value):
             # YAML requires unique keys; the parser would keep the last one.
-            keys = [self.construct_object(key, deep=deep) for key, _ in node.value]
-            twice = next(key for key in keys if keys.count(key) > 1)
+            keys = Counter(self.construct_object(key, deep=deep) for key, _ in node.value)
+            ((twice, _),) = keys.most_common(1)
             line = node.start_mark.line + 1
             raise DocumentError(f'has the key {twice!r} twice in the mapping of line {line}')
         return found
@@ -86,6 +89,9 @@ def read_document(text: str) -> Any:
         for event in yaml.parse(text, Loader=_Loader):
             if isinstance(event, yaml.AliasEvent):
                 raise DocumentError(f'refers to &{event.anchor}; aliases are not read')
+            value = event.value if isinstance(event, yaml.ScalarEvent) else ''
+            if len(value) > _LONGEST_NUMBER and _NUMBER.fullmatch(value):
+                raise DocumentError(f'has a number of {len(value)} characters')
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)
             if depth > _DEEPEST:

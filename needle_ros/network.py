@@ -22,6 +22,10 @@ LOCAL: Final = {
     **dict.fromkeys(PROFILES, str(Path(__file__).with_name('loopback.xml'))),
 }
 
+#: Environment variables of ROS 2: credentials are used, and their folder.
+SECURITY: Final = 'ROS_SECURITY_ENABLE'
+KEYSTORE: Final = 'ROS_SECURITY_KEYSTORE'
+
 #: Environment variable of ROS 2: nodes of different domains are isolated.
 DOMAIN: Final = 'ROS_DOMAIN_ID'
 
@@ -42,6 +46,17 @@ def stay_local(environment: MutableMapping[str, str]) -> None:
         environment.update(LOCAL)
     else:
         environment.setdefault(RANGE, 'LOCALHOST')
+
+
+def check_security(environment: Mapping[str, str]) -> None:
+    """Raise `ParameterError` if security is requested in a way that ROS 2 ignores silently."""
+    given = environment.get(SECURITY) or 'false'
+    if given not in ('true', 'false'):
+        raise ParameterError(f'{SECURITY} must be true or false, got {given!r}')
+    if given == 'true' and not environment.get(KEYSTORE):
+        raise ParameterError(
+            f'{SECURITY} is true, but {KEYSTORE} names no keystore: nodes would not be protected'
+        )
 
 
 def domain_of(environment: Mapping[str, str]) -> int:

@@ -18,7 +18,7 @@ from typing import Final
 
 from needle_ros.base_node import BaseNode, steady_timer
 from needle_ros.errors import NeedleError
-from needle_ros.network import LOCAL, RANGE, stay_local
+from needle_ros.network import check_security, LOCAL, RANGE, stay_local
 from needle_ros.parameter_node import sections, shared_names, unmatched_files
 from needle_ros.process import ENDINGS
 import rclpy
@@ -69,6 +69,7 @@ def run(kind: Callable[[], BaseNode]) -> int:
         libc.mallopt(_M_MMAP_THRESHOLD, 2**19)
     try:
         try:
+            check_security(os.environ)
             _check_words(kind, sys.argv)
             # The handlers of rclpy end the context before the node can publish its last command.
             rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)

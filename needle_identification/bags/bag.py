@@ -165,6 +165,9 @@ def _span(file: Path) -> tuple[int, int] | None:
 
 def _metadata(folder: Path) -> tuple[list[str], str]:
     """Return the files listed in the metadata of a bag, and its lost messages."""
+    if not (folder / METADATA).is_file():
+        # Not a pipe, either, which may never end.
+        raise FileNotFoundError(METADATA)
     with (folder / METADATA).open(encoding='utf-8') as stream:
         document = read_document(stream.read(LARGEST + 1))
     information = document['rosbag2_bagfile_information']

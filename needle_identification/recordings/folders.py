@@ -15,13 +15,20 @@ def recordings_in(path: Path) -> list[Path]:
 
     Without metadata, a folder with the files of one recording and no other is a bag.
     """
-    inside = _inside(path)
+    return _recordings_in(path, set())
+
+
+def _recordings_in(path: Path, seen: set[Path]) -> list[Path]:
+    # A link may lead to a folder above itself.
+    seen.add(path.resolve())
+    inside = [one for one in _inside(path) if not one.is_dir() or one.resolve() not in seen]
     if any(one.name == METADATA for one in inside):
         return [path]
     groups = recordings_among(one for one in inside if form_of(one) and one.is_file())
     found = [one for one in inside if is_table(one)]
     for folder in filter(_has_bag, inside):
-        found += recordings_in(folder)
+        if folder.resolve() not in seen:
+            found += _recordings_in(folder, seen)
     if len(groups) == 1 and not found:
         return [path]
     for group in groups:

@@ -53,7 +53,7 @@ def _text(found: Inspection, *, several: bool) -> str:
         for k, span in enumerate(ranges or ['']):
             rows.append((*(first if k == 0 else ('',) * len(first)), span))
     heads = ('topic', 'type', 'messages', 'per second', 'gaps', 'range')
-    lines = [found.path, table([tuple(map(shown, row)) for row in rows], heads)]
+    lines = [shown(found.path), table([tuple(map(shown, row)) for row in rows], heads)]
     lines += [f'warning: {shown(words)}' for words in found.losses]
     lines += [shown(words) for words in found.words]
     if found.command and not several:

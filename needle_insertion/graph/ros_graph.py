@@ -24,7 +24,7 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from needle_insertion.nodes import NODES
 from needle_ros.errors import JobError, ParameterError
-from needle_ros.network import claim, domain_of, is_claimed, LOCAL, stay_local
+from needle_ros.network import check_security, claim, domain_of, is_claimed, LOCAL, stay_local
 from needle_ros.process import DeferredSignals, ONE_THREAD
 from needle_ros.run_node import end, END_WITH_PARENT, INVALID_INPUT
 from rclpy.client import Client
@@ -153,6 +153,7 @@ class Graph:
         self._life_cycles: dict[str, Client] = {}
 
     def __enter__(self) -> Graph:
+        check_security(os.environ)
         # The context of this process also reads the environment.
         if self._shared:
             stay_local(os.environ)

@@ -25,7 +25,7 @@ from pathlib import Path
 from secrets import token_urlsafe
 import sys
 from time import monotonic
-from typing import Any, Final, Protocol
+from typing import Any, cast, Final, Protocol
 from urllib.parse import urlsplit
 
 from aiohttp import web, WSCloseCode, WSMessage, WSMsgType
@@ -51,7 +51,8 @@ _LATE: Final = 1.0
 _CHECK: Final = 'check'  #: Request without effect, whose answer is whether the token is valid.
 BEAT: Final = 0.25  #: period of the clock that a page receives, also without frames [s]
 
-_PATIENCE: Final = 10.0  #: timeout of a reader that accepts no data [s]
+_PATIENCE: Final = 10.0  #: timeout of a reader that accepts no data, or sends no request [s]
+_MOST_CONNECTIONS: Final = 128  #: largest number of connections, far from that of open files
 _HEARTBEAT: Final = 20.0  #: period of the heartbeat of a WebSocket [s]
 
 _PAGE: Final = Path(__file__).with_name('page')
@@ -104,6 +105,13 @@ class Control(Protocol):
         """Call the services of a key of `REQUESTS`; return success and the answers."""
 
 
+class _Refusal(asyncio.Protocol):
+    """A connection that is closed at once."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        cast(asyncio.Transport, transport).abort()
+
+
 class Server:
     """HTTP and WebSocket server; `ParameterError` if a control would be open to other machines."""
 
@@ -136,6 +144,9 @@ class Server:
         self._anatomy = {'text': anatomy, 'content_type': 'application/json'}
         self._open: set[web.WebSocketResponse] = set()
         self._runner: web.AppRunner | None = None
+        self._listener: asyncio.Server | None = None
+        #: Connections that have not sent a request yet.
+        self._silent: set[Any] = set()
 
     @property
     def address(self) -> str:
@@ -168,9 +179,9 @@ class Server:
         app.on_shutdown.append(self._close)
         self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0, logger=_logger())
         await self._runner.setup()
-        site = web.TCPSite(self._runner, self._host, self._port)
+        loop = asyncio.get_running_loop()
         try:
-            await site.start()
+            self._listener = await loop.create_server(self._connection, self._host, self._port)
         except OSError as error:
             await self.end()
             other = self._port + 1 if self._port < 65535 else PORT
@@ -181,9 +192,27 @@ class Server:
                 f'cannot listen on {self._host}, port {self._port}: {why}; '
                 f'use another one, such as --port {other}, or --port 0 for a free one'
             ) from error
-        self._port = self._runner.addresses[0][1]
+        self._port = self._listener.sockets[0].getsockname()[1]
+
+    def _connection(self) -> asyncio.Protocol:
+        """Return the handler of a new connection, which must send a request in time."""
+        server = self._runner.server if self._runner is not None else None
+        if server is None or len(server.connections) >= _MOST_CONNECTIONS:
+            return _Refusal()
+        handler = server()
+        self._silent.add(handler)
+        asyncio.get_running_loop().call_later(_PATIENCE, self._expect_request, handler)
+        return handler
+
+    def _expect_request(self, handler: web.RequestHandler) -> None:
+        if handler in self._silent and handler.transport is not None:
+            handler.transport.abort()
+        self._silent.discard(handler)
 
     async def end(self) -> None:
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
         if self._runner is not None:
             await self._runner.cleanup()
             self._runner = None
@@ -200,6 +229,7 @@ class Server:
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
         """Reject requests that a foreign page can make a browser send."""
+        self._silent.discard(request.protocol)
         fault = self._fault(request.headers.get('Host', ''), request.headers.get('Origin'))
         if fault:
             return web.Response(status=403, text=f'{fault}\n', headers=_HEADERS)
@@ -215,6 +245,8 @@ class Server:
             name, port = parts.hostname or '', parts.port or 80
             # localhost or an address: not resolved by a name server.
             allowed = name == 'localhost' or ip_address(name).is_loopback or not self._local
+            whole = f'[{name}]' if ':' in name else name
+            allowed &= host.lower() in (f'{whole}:{port}', whole)
         except ValueError:
             allowed, port = False, 0
         if not allowed or port != self._port:

@@ -19,7 +19,7 @@ from needle_insertion.watch.view import CONFIGURED, View
 from needle_ros import contract
 from needle_ros.contract import Qos, Topic
 from needle_ros.errors import JobError, MessageError, ParameterError
-from needle_ros.network import domain_of, stay_local
+from needle_ros.network import check_security, domain_of, stay_local
 from needle_ros.parameter_file import parameters_in
 from needle_ros.status import read_reports
 from needle_ros.wire import MessageReader, read_line, read_string
@@ -166,6 +166,7 @@ class Buttons:
 @contextmanager
 def watching(*, control: bool) -> Iterator[tuple[View, Callable[[float], None], Buttons | None]]:
     """Join the ROS graph of the user; yield the view, a function to update it, and buttons."""
+    check_security(os.environ)
     stay_local(os.environ)
     context = Context()
     context.init(domain_id=domain_of(os.environ))

@@ -530,9 +530,14 @@ def test_limits_can_be_raised(tmp_path: Path) -> None:
         'a: [',
         '\0',
         '!!python/object/apply:os.getcwd []',
+        # In base 60: 40 s in the parser.
+        'a: ' + '1:' * (2**19 - 10) + '1',
+        'a: ' + '9' * (2**20 - 10),
+        '{' + ', '.join(map(str, [*range(100_000), 99_999])) + '}',
     ],
+    ids=str.__len__,
 )
 def test_documents_that_expand_are_rejected(text: str) -> None:
-    """Aliases, nesting depth, length, invalid YAML, and code."""
+    """Aliases, nesting depth, length, invalid YAML, code, long numbers and repeated keys."""
     with pytest.raises(DocumentError):
         read_document(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import replace
 from functools import partial
 import json
@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 from needle_identification import BagWriter, RecordingError
 from needle_identification.bags.messages import encode
 from needle_insertion import cli
-from needle_insertion.watch import recorded
+from needle_insertion.watch import recorded, server
 from needle_insertion.watch.live import Live, LiveReader, RecordedReader
 from needle_insertion.watch.recorded import PagePlayback, ShownRecording
 from needle_insertion.watch.server import BEAT, LONGEST, MOST_READERS, Server
@@ -620,7 +620,8 @@ async def test_foreign_host_header_is_rejected() -> None:
         for host in (
             f'evil.example:{page.port}', 'evil.example', '127.0.0.1', '127.0.0.1:1', '',
             f'127.0.0.1.evil.example:{page.port}', f'8.8.8.8:{page.port}', '[::1',
-            f'@:{page.port}',
+            f'@:{page.port}', f'evil@127.0.0.1:{page.port}', f'127.0.0.1:{page.port}/x',
+            f'127.0.0.1:{page.port}?x', f'127.0.0.1:0{page.port}',
         ):  # fmt: skip
             async with page.session.get(page.url, headers={'Host': host}) as reply:
                 assert reply.status in (400, 403), host
@@ -952,6 +953,30 @@ def test_recorded_reader_controls_playback(watched: Path) -> None:
         assert json.loads(await waiting)['frame']['time'] >= 3.0
 
     asyncio.run(asyncio.wait_for(look(), 60.0))
+
+
+@in_loop
+async def test_idle_connections_do_not_hold_the_page() -> None:
+    """Above the limit they are closed at once, and without a request after some seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(server, '_MOST_CONNECTIONS', 8)
+        patch.setattr(server, '_PATIENCE', 0.5)
+        await _with_idle_connections()
+
+
+async def _with_idle_connections() -> None:
+    async with served() as page:
+        idle = [await asyncio.open_connection('127.0.0.1', page.port) for _ in range(20)]
+        for _, writer in idle[:4]:
+            writer.write(b'GET / HTTP/1.1\r\nHost')
+        ended = [reader.read(1) for reader, _ in idle]
+        await asyncio.gather(*ended, return_exceptions=True)
+        for _, writer in idle:
+            writer.close()
+            with suppress(ConnectionError):
+                await writer.wait_closed()
+        async with page.session.get(page.url) as reply:
+            assert reply.status == 200
 
 
 @in_loop

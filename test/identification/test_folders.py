@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A folder stands for the recordings in it; the parts of a split bag are one recording."""
 
+import os
 from pathlib import Path
 import shutil
 
 from needle_identification import RecordingError
-from needle_identification.bags.bag import Bag
+from needle_identification.bags.bag import Bag, METADATA
 from needle_identification.recordings.folders import recordings_in
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -62,6 +63,23 @@ def test_a_folder_stands_for_the_recordings_in_it(tmp_path: Path) -> None:
         assert recordings_in(other) == [other]
     (tmp_path / 'x.mcap').touch()
     assert recordings_in(tmp_path) == [*found, tmp_path / 'x.mcap']
+
+
+def test_links_to_folders_above_are_not_followed(tmp_path: Path) -> None:
+    """Two links in a folder to itself make as many paths as the system permits."""
+    made = data_file(tmp_path / 'runs' / 'one.mcap')
+    other = data_file(tmp_path / 'other' / 'two.mcap')
+    for name in 'abc':
+        (made.parent / name).symlink_to('.')
+    (made.parent / 'there').symlink_to(other.parent)
+    (other.parent / 'back').symlink_to(made.parent)
+    assert {one.resolve() for one in recordings_in(made.parent)} == {made, other.parent}
+
+
+def test_metadata_that_is_a_pipe_is_not_read(tmp_path: Path) -> None:
+    made = data_file(tmp_path / 'bag' / 'one.mcap')
+    os.mkfifo(made.parent / METADATA)
+    assert any(f'no readable {METADATA}' in loss for loss in Bag(made.parent).losses)
 
 
 @pytest.mark.parametrize('names', [('gel.mcap', 'liver.mcap'), ('run.db3', 'run.mcap')])

@@ -12,9 +12,11 @@ import subprocess
 import sys
 
 from lxml import etree
-from needle_insertion.graph.ros_graph import GraphError
+from needle_insertion.graph.ros_graph import Graph, GraphError
 from needle_insertion.nodes import NODES
+from needle_insertion.watch.watch_node import watching
 from needle_ros.base_node import BaseNode
+from needle_ros.errors import ParameterError
 from needle_ros.network import LOCAL, PROFILES, RANGE, stay_local
 import pytest
 from reproduction.protocol import SHIPPED_BAGS
@@ -154,6 +156,36 @@ def test_enforced_security_rejects_nodes_without_credentials(
     assert ended.returncode != 0
     assert 'security' in ended.stderr.lower()
     assert probe.count_publishers('joint_states') == 0
+
+
+@pytest.mark.requirement('S-346')
+@pytest.mark.parametrize('strategy', ['Enforce', 'Permissive', ''])
+@pytest.mark.parametrize('enable', ['true', 'True', '1'])
+def test_requested_security_is_not_ignored(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, enable: str, strategy: str
+) -> None:
+    """Without a keystore, or with a value that ROS 2 does not know: one line."""
+    monkeypatch.setenv('ROS_SECURITY_ENABLE', enable)
+    monkeypatch.setenv('ROS_SECURITY_STRATEGY', strategy)
+    monkeypatch.delenv('ROS_SECURITY_KEYSTORE', raising=False)
+    said = (
+        'ROS_SECURITY_KEYSTORE names no keystore' if enable == 'true' else 'must be true or false'
+    )
+    with pytest.raises(ParameterError, match=said), Graph(tmp_path):
+        pass
+    with pytest.raises(ParameterError, match=said), watching(control=False):
+        pass
+    if strategy == 'Permissive':
+        ended = subprocess.run(
+            [sys.executable, '-m', NODES['plant']],
+            capture_output=True,
+            text=True,
+            timeout=120.0,
+            check=False,
+        )
+        assert ended.returncode == 2
+        (line,) = ended.stderr.splitlines()
+        assert said in line
 
 
 @pytest.mark.requirement('S-157', 'S-160')
