@@ -960,7 +960,7 @@ async def test_idle_connections_do_not_hold_the_page() -> None:
     """Above the limit they are closed at once, and without a request after some seconds."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(server, '_MOST_CONNECTIONS', 8)
-        patch.setattr(server, '_PATIENCE', 0.5)
+        patch.setattr(server, '_PATIENCE', 2.0)
         await _with_idle_connections()
 
 
